@@ -1,0 +1,90 @@
+"""Checks shared by everything that takes a user's input: each error says got, expected, remedy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+Vector = Any  # a field that takes what a user writes (a list, an array) and holds a read-only Array
+
+
+def vector(value: ArrayLike, n: int, name: str, owner: str) -> Array:
+    """A read-only float64 vector of length n without NaN; raises ValueError otherwise."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{owner}: {name} is {value!r}; expected {n} numbers: pass a list of floats") from None
+    if array.shape != (n,):
+        raise ValueError(f"{owner}: {name} has shape {array.shape}, expected ({n},): pass one number per coordinate")
+    if np.isnan(array).any():
+        raise ValueError(f"{owner}: {name} is {array.tolist()}; expected numbers, got NaN: check how it was computed")
+    array.setflags(write=False)
+    return array
+
+
+def bounds(lower: ArrayLike, upper: ArrayLike, n: int, names: tuple[str, str], owner: str,
+           coordinates: Sequence[str]) -> tuple[Array, Array]:
+    """Finite bounds with lower < upper in each coordinate; raises ValueError naming the first coordinate that fails."""
+    lb, ub = vector(lower, n, names[0], owner), vector(upper, n, names[1], owner)
+    for i, coordinate in enumerate(coordinates):
+        if not (np.isfinite(lb[i]) and np.isfinite(ub[i])):
+            raise ValueError(f"{owner}: {coordinate} is in [{lb[i]}, {ub[i]}]; expected finite bounds: "
+                             f"give {names[0]} and {names[1]} the largest values that make sense")
+        if not lb[i] < ub[i]:
+            raise ValueError(f"{owner}: {coordinate} is in [{lb[i]}, {ub[i]}], an empty interval; "
+                             f"expected {names[0]} < {names[1]}: swap or widen them")
+    return lb, ub
+
+
+def symbols(value: Any, name: str, owner: str) -> list[ca.SX]:
+    """The scalar symbols of a column of SX symbols; raises ValueError for anything else."""
+    if not isinstance(value, ca.SX):
+        raise ValueError(f"{owner}: {name} is a {type(value).__name__}; expected casadi.SX symbols: "
+                         f"use ca.SX.sym(...) (MX is not accepted)")
+    if value.is_empty() or not value.is_column():
+        raise ValueError(f"{owner}: {name} has shape {value.shape}, expected a column of symbols: use ca.vertcat(...)")
+    parts = ca.vertsplit(ca.densify(value))
+    for i, part in enumerate(parts):
+        if not part.is_symbolic():
+            raise ValueError(f"{owner}: {name}[{i}] is the expression {part}; expected a plain symbol ca.SX.sym(...)")
+    return parts
+
+
+def expression(value: Any, rows: int, allowed: ca.SX, name: str, owner: str) -> ca.SX:
+    """A dense SX column of `rows` entries in the allowed symbols only; raises ValueError otherwise."""
+    if isinstance(value, (int, float)):
+        value = ca.SX(value)
+    if not isinstance(value, ca.SX):
+        raise ValueError(f"{owner}: {name} is a {type(value).__name__}; expected a casadi.SX expression: "
+                         f"build it from the system's SX symbols (MX is not accepted)")
+    if value.shape != (rows, 1):
+        raise ValueError(f"{owner}: {name} has shape {value.shape}, expected ({rows}, 1): "
+                         f"{'one row per state, by ca.vertcat(...)' if rows > 1 else 'a scalar expression'}")
+    free = [s for s in ca.symvar(value) if not ca.depends_on(s, allowed)]
+    if free:
+        names = ", ".join(sorted(s.name() for s in free))
+        known = ", ".join(s.name() for s in ca.symvar(allowed))
+        raise ValueError(f"{owner}: {name} contains the symbol(s) {names}, expected only the system's own ({known}): "
+                         f"put a number in their place, or use the very symbols given to the System")
+    return ca.densify(value)
+
+
+def states(x: ArrayLike, nx: int, owner: str, name: str = "x0") -> tuple[Array, bool]:
+    """States as float64 rows [B, nx], and whether a single [nx] was given; NaN and other shapes raise ValueError."""
+    try:
+        array = np.asarray(x, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{name} is {x!r}; {owner} has nx = {nx}: pass numbers [nx] or [B, nx]") from None
+    single = array.ndim == 1
+    rows = array[None, :] if single else array
+    if rows.ndim != 2 or rows.shape[1] != nx:
+        raise ValueError(f"{name} has shape {array.shape}; {owner} has nx = {nx}: pass [{nx}] or [B, {nx}]")
+    if not np.isfinite(rows).all():
+        bad = int(np.flatnonzero(~np.isfinite(rows).all(axis=1))[0])
+        raise ValueError(f"{name}[{bad}] is {rows[bad].tolist()}; expected finite numbers: remove or repair that state")
+    return rows, single

@@ -1,0 +1,40 @@
+"""The one discretisation: RK4 steps under controls held over each interval, for torch and CasADi alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+Field = Callable[[Any, Any], Any]  # (x, u) -> xdot, torch or CasADi
+
+
+def rk4(f: Field, x: Any, u: Any, h: Any) -> Any:
+    """One classical Runge-Kutta step of length h, u held."""
+    k1 = f(x, u)
+    k2 = f(x + h / 2 * k1, u)
+    k3 = f(x + h / 2 * k2, u)
+    k4 = f(x + h * k3, u)
+    return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+
+def rk4_interval(f: Field, x: Any, u: Any, h: Any, substeps: int = 1) -> Any:
+    """The state after an interval of length h with u held, by `substeps` RK4 steps."""
+    for _ in range(substeps):
+        x = rk4(f, x, u, h / substeps)
+    return x
+
+
+def rk4_cost(f: Field, L: Field, x: Any, u: Any, h: Any, substeps: int = 1) -> tuple[Any, Any]:
+    """(the state after an interval, the integral of L over it): the same RK4 stages quadrate the cost."""
+    cost = 0
+    h = h / substeps
+    for _ in range(substeps):
+        k1 = f(x, u)
+        x2 = x + h / 2 * k1
+        k2 = f(x2, u)
+        x3 = x + h / 2 * k2
+        k3 = f(x3, u)
+        x4 = x + h * k3
+        cost = cost + h / 6 * (L(x, u) + 2 * L(x2, u) + 2 * L(x3, u) + L(x4, u))
+        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + f(x4, u))
+    return x, cost

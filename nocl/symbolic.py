@@ -1,0 +1,76 @@
+"""SX functions as instruction lists: the one walker behind torch, C and JSON, and functions as plain data."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+import casadi as ca
+
+OPERATIONS = {getattr(ca, name): name for name in dir(ca) if name.startswith("OP_")}
+
+
+class Instruction(NamedTuple):
+    """One step of an SX function on a work vector of scalars."""
+
+    op: str  # CasADi's name: OP_ADD, OP_SIN, OP_INPUT, OP_CONST, OP_OUTPUT, ...
+    out: tuple[int, ...]  # the work index it writes; of OP_OUTPUT: (output number, nonzero)
+    args: tuple[int, ...]  # the work indices it reads; of OP_INPUT: (input number, nonzero)
+    value: float  # of OP_CONST
+
+
+def expand(function: ca.Function) -> ca.Function:
+    """The same function as SX with dense inputs and outputs; MX is expanded."""
+    if not function.is_a("SXFunction"):
+        function = function.expand()
+    args = [ca.SX.sym(f"{function.name_in(i)}_", *function.size_in(i)) for i in range(function.n_in())]
+    results = [ca.densify(r) for r in function.call(args)]
+    return ca.Function(function.name(), args, results, function.name_in(), function.name_out())
+
+
+def instructions(function: ca.Function) -> Iterator[Instruction]:
+    """The instructions of an SX function, in order."""
+    for k in range(function.n_instructions()):
+        op = OPERATIONS[function.instruction_id(k)]
+        value = function.instruction_constant(k) if op == "OP_CONST" else 0.0
+        yield Instruction(op, tuple(function.instruction_output(k)), tuple(function.instruction_input(k)), value)
+
+
+def to_data(function: ca.Function) -> dict[str, Any]:
+    """A function as JSON data that any version of CasADi can read back, exactly (constants as hex floats)."""
+    function = expand(function)
+    code = [[i.op, *i.out, *i.args] if i.op != "OP_CONST" else [i.op, *i.out, float(i.value).hex()]
+            for i in instructions(function)]
+    return {"name": function.name(), "work": function.sz_w(), "code": code,
+            "inputs": [[function.name_in(i), *function.size_in(i)] for i in range(function.n_in())],
+            "outputs": [[function.name_out(i), *function.size_out(i)] for i in range(function.n_out())]}
+
+
+def from_data(data: Mapping[str, Any], inputs: list[ca.SX] | None = None) -> ca.Function:
+    """The function that to_data wrote; `inputs` gives the symbols to rebuild it in (default: new ones).
+
+    Raises ValueError where the data is not such a function.
+    """
+    try:
+        symbols = inputs or [ca.SX.sym(name, *size) for name, *size in data["inputs"]]
+        outputs = [ca.SX.zeros(*size) for _, *size in data["outputs"]]
+        _run(data["code"], [ca.SX(0)] * int(data["work"]), symbols, outputs)
+        return ca.Function(data["name"], symbols, outputs, [i[0] for i in data["inputs"]], [o[0] for o in data["outputs"]])
+    except (KeyError, IndexError, TypeError, AttributeError, RuntimeError) as error:
+        raise ValueError(f"not a function written by nocl: {type(error).__name__}: {error}") from error
+
+
+def _run(code: list[list[Any]], work: list[ca.SX], inputs: list[ca.SX], outputs: list[ca.SX]) -> None:
+    for op, *args in code:
+        if op == "OP_INPUT":
+            work[args[0]] = inputs[args[1]].nz[args[2]]
+        elif op == "OP_OUTPUT":
+            outputs[args[0]].nz[args[1]] = work[args[2]]
+        elif op == "OP_CONST":
+            work[args[0]] = ca.SX(float.fromhex(args[1]))
+        elif not op.startswith("OP_"):
+            raise ValueError(f"{op!r} is not an operation of CasADi's")
+        elif len(args) == 2:
+            work[args[0]] = ca.SX.unary(getattr(ca, op), work[args[1]])
+        else:
+            work[args[0]] = ca.SX.binary(getattr(ca, op), work[args[1]], work[args[2]])
