@@ -27,6 +27,21 @@ def vector(value: ArrayLike, n: int, name: str, owner: str) -> Array:
     return array
 
 
+def weight(value: ArrayLike, n: int, name: str, owner: str) -> Array:
+    """A weight of a quadratic cost as a symmetric positive semidefinite [n, n]: from a number, a diagonal or a matrix."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise ValueError(f"{owner}: the weight {name} is {value!r}; expected a number, {n} numbers or a matrix") from None
+    matrix = array * np.eye(n) if array.shape in ((), (n,)) else array
+    if matrix.shape != (n, n):
+        raise ValueError(f"{owner}: the weight {name} has shape {array.shape}; expected a number, [{n}] or [{n}, {n}]")
+    if not np.isfinite(matrix).all() or not np.array_equal(matrix, matrix.T) or np.linalg.eigvalsh(matrix)[0] < -1e-12:
+        raise ValueError(f"{owner}: the weight {name} is {array.tolist()}; expected a symmetric positive semidefinite "
+                         "matrix of finite numbers, so that the cost has a minimum at the goal")
+    return matrix
+
+
 def bounds(lower: ArrayLike, upper: ArrayLike, n: int, names: tuple[str, str], owner: str,
            coordinates: Sequence[str]) -> tuple[Array, Array]:
     """Finite bounds with lower < upper in each coordinate; raises ValueError naming the first coordinate that fails."""

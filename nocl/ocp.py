@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -110,6 +111,20 @@ class OCP:
             if not np.isfinite(values.full()).all():
                 raise ValueError(f"{owner}: {what} gives NaN or inf at an initial state or at the goal; expected finite "
                                  f"values for every state of the problem ({', '.join(s.state_names)})")
+
+    @classmethod
+    def quadratic(cls, system: System, *, x_goal: Vector, u_goal: Vector, R: Vector = 0.01, P: Vector = 1.0,
+                  **options: Any) -> OCP:
+        """L = (u - u*)' R (u - u*), G = (x - x*)' P (x - x*); `options` are OCP's other arguments.
+
+        R and P are numbers (times the identity), diagonals [n] or symmetric positive semidefinite matrices [n, n].
+        """
+        owner = f"OCP on {system.name!r}"
+        du = system.u - ca.DM(checks.vector(u_goal, system.nu, "u_goal", owner))
+        dx = system.x - ca.DM(checks.vector(x_goal, system.nx, "x_goal", owner))
+        return cls(system, running=ca.bilin(ca.DM(checks.weight(R, system.nu, "R", owner)), du, du),
+                   terminal=ca.bilin(ca.DM(checks.weight(P, system.nx, "P", owner)), dx, dx),
+                   x_goal=x_goal, u_goal=u_goal, **options)
 
     @cached_property
     def L(self) -> ca.Function:
