@@ -28,11 +28,11 @@ def vector(value: ArrayLike, n: int, name: str, owner: str) -> Array:
 
 
 def weight(value: ArrayLike, n: int, name: str, owner: str) -> Array:
-    """A weight of a quadratic cost as a symmetric positive semidefinite [n, n]: from a number, a diagonal or a matrix."""
+    """A weight of a quadratic cost as a symmetric positive semidefinite [n, n], from a number, diagonal or matrix."""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"{owner}: the weight {name} is {value!r}; expected a number, {n} numbers or a matrix") from None
+        raise ValueError(f"{owner}: the weight {name} is {value!r}; expected a number, [{n}] or [{n}, {n}]") from None
     matrix = array * np.eye(n) if array.shape in ((), (n,)) else array
     if matrix.shape != (n, n):
         raise ValueError(f"{owner}: the weight {name} has shape {array.shape}; expected a number, [{n}] or [{n}, {n}]")

@@ -83,7 +83,8 @@ class OCP:
 
     def _check_goal(self, owner: str) -> None:
         s = self.system
-        boxes = [(s.state_names, self.x_goal, s.lbx, s.ubx, "x_goal"), (s.control_names, self.u_goal, s.lbu, s.ubu, "u_goal")]
+        boxes = [(s.state_names, self.x_goal, s.lbx, s.ubx, "x_goal"),
+                 (s.control_names, self.u_goal, s.lbu, s.ubu, "u_goal")]
         for names, goal, lb, ub, what in boxes:
             for name, g, low, high in zip(names, goal, lb, ub, strict=True):
                 if not low <= g <= high:
@@ -100,8 +101,8 @@ class OCP:
         outside = (d.centre < s.lbx) | (d.centre > s.ubx)
         if outside.any():
             i = int(np.flatnonzero(outside)[0])
-            raise ValueError(f"{owner}: initial_states is centred at {s.state_names[i]} = {d.centre[i]:g}, outside the box "
-                             f"[{s.lbx[i]:g}, {s.ubx[i]:g}]: move it or widen lbx, ubx")
+            raise ValueError(f"{owner}: initial_states is centred at {s.state_names[i]} = {d.centre[i]:g}, outside the "
+                             f"box [{s.lbx[i]:g}, {s.ubx[i]:g}]: move it or widen lbx, ubx")
 
     def _check_finite(self, owner: str) -> None:
         s = self.system
@@ -109,8 +110,8 @@ class OCP:
         u = np.repeat(self.u_goal[:, None], x.shape[1], axis=1)
         for what, values in (("running", self.L(x, u)), ("terminal", self.G(x)), ("a path constraint", self.h(x))):
             if not np.isfinite(values.full()).all():
-                raise ValueError(f"{owner}: {what} gives NaN or inf at an initial state or at the goal; expected finite "
-                                 f"values for every state of the problem ({', '.join(s.state_names)})")
+                raise ValueError(f"{owner}: {what} gives NaN or inf at an initial state or at the goal; expected "
+                                 f"finite values for every state of the problem ({', '.join(s.state_names)})")
 
     @classmethod
     def quadratic(cls, system: System, *, x_goal: Vector, u_goal: Vector, R: Vector = 0.01, P: Vector = 1.0,
@@ -139,7 +140,8 @@ class OCP:
     @cached_property
     def h(self) -> ca.Function:
         """x -> path constraints [number of them], each >= 0 where it holds."""
-        return ca.Function("h", [self.system.x], [ca.vertcat(ca.SX(0, 1), *self.path_constraints.values())], ["x"], ["h"])
+        h = ca.vertcat(ca.SX(0, 1), *self.path_constraints.values())
+        return ca.Function("h", [self.system.x], [h], ["x"], ["h"])
 
     @cached_property
     def L_soft(self) -> ca.Function:
@@ -155,4 +157,4 @@ class OCP:
                  f"  goal x* = {self.x_goal.tolist()}, u* = {self.u_goal.tolist()}",
                  f"  x0 ~ {self.initial_states}"]
         lines += [f"  {name}: {equations(h)[0]} >= 0" for name, h in self.path_constraints.items()]
-        return "\n".join(lines + [repr(self.system)])
+        return "\n".join([*lines, repr(self.system)])

@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 
 import nocl
+from nocl.checks import Vector
 
 
 def system(
@@ -33,7 +34,7 @@ def system(
         units={"p": "m", "v": "m/s", "theta": "rad", "omega": "rad/s", "u": f"{gain:g} N"})
 
 
-def ocp(*, horizon: float = 4.0, R: nocl.checks.Vector = 0.01, P: nocl.checks.Vector = 1.0, std: float = 0.1,
+def ocp(*, horizon: float = 4.0, R: Vector = 0.01, P: Vector = 1.0, std: float = 0.1,
         **constants: float) -> nocl.OCP:
     """Swing up from hanging at rest, x0 ~ N([0, 0, pi, 0], std^2 I), within `horizon` seconds; constants: system's."""
     return nocl.OCP.quadratic(
