@@ -1,0 +1,46 @@
+# make demo   sets up .venv and runs the main job on cart-pole, ending with the report
+# make test   sets up .venv, lints and tests; make test-slow also runs the tests of minutes
+# Needs Python 3.11, gcc, g++ and make; everything else comes from the package registry.
+
+PYTHON ?= python3.11
+TORCH ?= torch==2.13.0# pinned and installed first: the CPU build, where a range would take a CUDA build of gigabytes
+L4CASADI ?= l4casadi==2.0.0
+BIN := .venv/bin
+STAMP := .venv/.set-up
+FOLDERS := nocl systems solvers comparisons
+
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+export PIP_NO_INPUT := 1
+PIP := $(BIN)/python -m pip install --quiet
+
+.PHONY: demo test test-slow lint set-up clean
+
+demo: set-up
+	$(BIN)/nocl run cartpole --out runs/cartpole
+
+test: lint
+	$(BIN)/python -m pytest -m "not slow"
+
+test-slow: lint
+	$(BIN)/python -m pytest
+
+lint: set-up
+	$(BIN)/ruff check .
+	$(BIN)/mypy $(FOLDERS)
+
+set-up: $(STAMP)
+
+# L4CasADi has no wheel: its build needs torch, CMake < 4 and no isolation. Not from the cache of wheels, since one that was
+# built beside another torch would be taken for this one.
+$(STAMP): pyproject.toml
+	@for tool in $(PYTHON) gcc g++; do \
+	    command -v $$tool > /dev/null || { echo "$$tool was not found: install Python 3.11, gcc and g++, or set PYTHON=..."; exit 2; }; done
+	$(PYTHON) -m venv .venv
+	$(PIP) "$(TORCH)"
+	$(PIP) -e ".[dev]"
+	$(PIP) "cmake<4" ninja scikit-build "setuptools>=77" wheel
+	PATH="$(CURDIR)/$(BIN):$$PATH" $(PIP) --no-build-isolation --no-cache-dir "$(L4CASADI)"
+	@touch $@
+
+clean:
+	rm -rf .venv build nocl.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
