@@ -1,0 +1,240 @@
+/* Control-limited DDP over lanes. Generated before this file: N, M, the lengths NY (network values, 0 without), NET (their
+   values, gradients and Hessians), NJ, NW (nonzeros of a stage's Jacobian and Hessian), and
+
+   networks(weights, x, u, order, net)    net[NET]: values (order 0), and derivatives with respect to features (order 2)
+   field(x, u, net, out)                  out[N+1]: xdot, L
+   stage_jacobian(x, u, net, J)           nonzeros of d(xdot, L)/d(x, u)
+   stage_hessian(x, u, net, mu, W)        nonzeros of the Hessian of mu'(xdot, L)
+   stage_adjoints(J2, J3, J4, lam, h, mu) mu[4 (N+1)], what weights the four stages of a Runge-Kutta step
+   step_derivatives(J, W, h, F, l, H)     F[N NZ] = dx+/dz, l[NZ] = dcost/dz, H[NZ NZ] the Hessian of lam'x+ + cost
+   terminal(x, G, Gx, Gxx)
+
+   Arrays are problem-major, rows as numpy has them: x [B, K+1, N], u [B, K, M], gains [B, K, M, N]. */
+#define NZ (N + M)
+
+static void eval_field(const double *weights, const lane *x, const lane *u, lane *out)
+{
+    lane net[NET + 1];
+    networks(weights, x, u, 0, net);
+    field(x, u, net, out);
+}
+
+/* One Runge-Kutta step with its stages' states s[4][N]; returns the cost of the step. */
+static lane step(const double *weights, const lane *x, const lane *u, lane h, lane s[4][N], lane *next)
+{
+    static const double reach[4] = {0, 0.5, 0.5, 1}, share[4] = {1. / 6, 1. / 3, 1. / 3, 1. / 6};
+    lane k[N + 1], cost = {0};
+    for (int i = 0; i < N; ++i) next[i] = x[i];
+    for (int j = 0; j < 4; ++j) {
+        for (int i = 0; i < N; ++i) s[j][i] = j ? x[i] + reach[j] * h * k[i] : x[i];
+        eval_field(weights, s[j], u, k);
+        for (int i = 0; i < N; ++i) next[i] += share[j] * h * k[i];
+        cost += share[j] * h * k[N];
+    }
+    return cost;
+}
+
+/* u = clip(u_bar + alpha k + gain (x - x_bar)) from x0; writes x, u, J. */
+void nocl_rollout(int64_t first, int64_t last, const int64_t *index, int64_t K, const double *weights,
+                  const double *lb, const double *ub, const double *h_, const double *x0, const double *x_bar,
+                  const double *u_bar, const double *k, const double *gain, const double *alpha,
+                  double *x_, double *u_, double *J)
+{
+    for (int64_t b = first; b < last; ++b) {
+        const int64_t *at = index + b * WIDTH;
+        lane x[N], u[M], s[4][N], next[N], G[1], Gx[N], Gxx[N * N], cost = {0};
+        const lane h = gather(h_, at, 1, 0), a = gather(alpha, at, 1, 0);
+        for (int i = 0; i < N; ++i) x[i] = gather(x0, at, N, i);
+        for (int64_t t = 0; t < K; ++t) {
+            lane dx[N];
+            for (int i = 0; i < N; ++i) {
+                scatter(x_, at, (K + 1) * N, t * N + i, x[i]);
+                dx[i] = x[i] - gather(x_bar, at, (K + 1) * N, t * N + i);
+            }
+            for (int j = 0; j < M; ++j) {
+                u[j] = gather(u_bar, at, K * M, t * M + j) + a * gather(k, at, K * M, t * M + j);
+                for (int i = 0; i < N; ++i) u[j] += gather(gain, at, K * M * N, (t * M + j) * N + i) * dx[i];
+                u[j] = where(u[j] < splat(lb[j]), splat(lb[j]), where(u[j] > splat(ub[j]), splat(ub[j]), u[j]));
+                scatter(u_, at, K * M, t * M + j, u[j]);
+            }
+            cost += step(weights, x, u, h, s, next);
+            for (int i = 0; i < N; ++i) x[i] = next[i];
+        }
+        for (int i = 0; i < N; ++i) scatter(x_, at, (K + 1) * N, K * N + i, x[i]);
+        terminal(x, G, Gx, Gxx);
+        scatter(J, at, 1, 0, cost + G[0]);
+    }
+}
+
+/* L L' = Q on the free controls, the identity on those held; returns where Q is positive definite. */
+static mask factor(lane Q[M][M], const mask *held, lane L[M][M])
+{
+    mask positive = all_lanes();
+    for (int i = 0; i < M; ++i)
+        for (int j = 0; j <= i; ++j) {
+            lane sum = where(held[i] | held[j], splat(i == j), Q[i][j]);
+            for (int r = 0; r < j; ++r) sum -= L[i][r] * L[j][r];
+            if (i == j) {
+                const mask ok = sum > 1e-14;
+                positive &= ok;
+                L[i][i] = v_sqrt(where(ok, sum, splat(1)));
+            } else
+                L[i][j] = sum / L[j][j];
+        }
+    return positive;
+}
+
+/* L L' x = x, in place. */
+static void substitute(lane L[M][M], lane *x)
+{
+    for (int i = 0; i < M; ++i) {
+        for (int r = 0; r < i; ++r) x[i] -= L[i][r] * x[r];
+        x[i] /= L[i][i];
+    }
+    for (int i = M - 1; i >= 0; --i) {
+        for (int r = i + 1; r < M; ++r) x[i] -= L[r][i] * x[r];
+        x[i] /= L[i][i];
+    }
+}
+
+/* The box-constrained Newton step: controls pushed out of [lb, ub] are held at the bound, the others solved again. */
+static mask boxed_newton(lane Q[M][M], const lane *q, const lane *u, const double *lb, const double *ub,
+                         mask *held, lane *k, lane L[M][M])
+{
+    mask positive = all_lanes();
+    for (int i = 0; i < M; ++i) {
+        held[i] = ((u[i] <= splat(lb[i])) & (q[i] > 0)) | ((u[i] >= splat(ub[i])) & (q[i] < 0));
+        k[i] = (lane){0};
+    }
+    for (int pass = 0; pass <= M; ++pass) {
+        lane rhs[M];
+        for (int i = 0; i < M; ++i) {
+            rhs[i] = -q[i];
+            for (int j = 0; j < M; ++j) rhs[i] -= where(held[j], Q[i][j] * k[j], (lane){0});
+            rhs[i] = where(held[i], k[i], rhs[i]);
+        }
+        positive &= factor(Q, held, L);
+        substitute(L, rhs);
+        for (int i = 0; i < M; ++i) {
+            const lane low = splat(lb[i]) - u[i], high = splat(ub[i]) - u[i];
+            const mask below = ~held[i] & (rhs[i] < low), above = ~held[i] & (rhs[i] > high);
+            if (pass < M) held[i] |= below | above;
+            k[i] = where(below, low, where(above, high, rhs[i]));
+        }
+    }
+    return positive;
+}
+
+/* gain = -Q^-1 Qux on the free controls, 0 on those held. */
+static void feedback(lane L[M][M], lane Q[NZ][NZ], const mask *held, lane gain[M][N])
+{
+    for (int i = 0; i < N; ++i) {
+        lane column[M];
+        for (int j = 0; j < M; ++j) column[j] = where(held[j], (lane){0}, -Q[N + j][i]);
+        substitute(L, column);
+        for (int j = 0; j < M; ++j) gain[j][i] = column[j];
+    }
+}
+
+static void stage_terms(const double *weights, lane s[4][N], const lane *u, const lane *lam, lane h,
+                        lane *F, lane *l, lane *H)
+{
+    lane net[4][NET + 1], J[4 * NJ], W[4 * NW + 1], mu[4 * (N + 1)];
+    for (int j = 0; j < 4; ++j) {
+        networks(weights, s[j], u, 2, net[j]);
+        stage_jacobian(s[j], u, net[j], J + j * NJ);
+    }
+    stage_adjoints(J + NJ, J + 2 * NJ, J + 3 * NJ, lam, &h, mu);
+    for (int j = 0; j < 4; ++j) stage_hessian(s[j], u, net[j], mu + j * (N + 1), W + j * NW);
+    step_derivatives(J, W, &h, F, l, H);
+}
+
+/* Q = H + F' Vxx F, q = l + F' Vx. */
+static void action_value(const lane *F, const lane *l, const lane *H, const lane *Vx, const lane *Vxx,
+                         lane Q[NZ][NZ], lane *q)
+{
+    lane VF[N][NZ];
+    for (int i = 0; i < N; ++i)
+        for (int j = 0; j < NZ; ++j) {
+            lane sum = {0};
+            for (int r = 0; r < N; ++r) sum += Vxx[i * N + r] * F[r * NZ + j];
+            VF[i][j] = sum;
+        }
+    for (int i = 0; i < NZ; ++i) {
+        q[i] = l[i];
+        for (int r = 0; r < N; ++r) q[i] += F[r * NZ + i] * Vx[r];
+        for (int j = 0; j <= i; ++j) {
+            lane sum = H[i * NZ + j];
+            for (int r = 0; r < N; ++r) sum += F[r * NZ + i] * VF[r][j];
+            Q[i][j] = Q[j][i] = sum;
+        }
+    }
+}
+
+/* V of this node from the next one's, under u + k + gain dx. */
+static void value_update(lane Q[NZ][NZ], const lane *q, const lane *k, lane gain[M][N], lane *Vx, lane *Vxx)
+{
+    lane QK[M][N], Qk[M];  /* Quu gain + Qux, Quu k + qu */
+    for (int j = 0; j < M; ++j) {
+        Qk[j] = q[N + j];
+        for (int r = 0; r < M; ++r) Qk[j] += Q[N + j][N + r] * k[r];
+        for (int i = 0; i < N; ++i) {
+            QK[j][i] = Q[N + j][i];
+            for (int r = 0; r < M; ++r) QK[j][i] += Q[N + j][N + r] * gain[r][i];
+        }
+    }
+    for (int i = 0; i < N; ++i) {
+        Vx[i] = q[i];
+        for (int j = 0; j < M; ++j) Vx[i] += gain[j][i] * Qk[j] + Q[N + j][i] * k[j];
+        for (int c = 0; c <= i; ++c) {
+            lane sum = Q[i][c];
+            for (int j = 0; j < M; ++j) sum += gain[j][i] * QK[j][c] + Q[N + j][i] * gain[j][c];
+            Vxx[i * N + c] = Vxx[c * N + i] = sum;
+        }
+    }
+}
+
+/* The Riccati sweep about (x, u). Writes k, gain, slope = sum k'q, curve = sum k'Q k / 2, whether every Quu + mu I was
+   positive, and, where asked for (not NULL), V [B, K+1], V_x [B, K+1, N], V_xx [B, K+1, N, N]. */
+void nocl_backward(int64_t first, int64_t last, const int64_t *index, int64_t K, const double *weights,
+                   const double *lb, const double *ub, const double *h_, const double *x_, const double *u_,
+                   const double *mu_, double *k_, double *gain_, double *slope_, double *curve_, double *positive_,
+                   double *V_, double *Vx_, double *Vxx_)
+{
+    for (int64_t b = first; b < last; ++b) {
+        const int64_t *at = index + b * WIDTH;
+        lane x[N], u[M], s[4][N], next[N], V[1], Vx[N], Vxx[N * N], slope = {0}, curve = {0};
+        const lane h = gather(h_, at, 1, 0), reg = gather(mu_, at, 1, 0);
+        mask positive = all_lanes();
+        for (int i = 0; i < N; ++i) x[i] = gather(x_, at, (K + 1) * N, K * N + i);
+        terminal(x, V, Vx, Vxx);
+        for (int64_t t = K;; --t) {
+            if (V_) scatter(V_, at, K + 1, t, V[0]);
+            if (Vx_) for (int i = 0; i < N; ++i) scatter(Vx_, at, (K + 1) * N, t * N + i, Vx[i]);
+            if (Vxx_) for (int i = 0; i < N * N; ++i) scatter(Vxx_, at, (K + 1) * N * N, t * N * N + i, Vxx[i]);
+            if (t == 0) break;
+            lane F[N * NZ], l[NZ], H[NZ * NZ], Q[NZ][NZ], q[NZ], Quu[M][M], L[M][M], k[M], gain[M][N];
+            mask held[M];
+            for (int i = 0; i < N; ++i) x[i] = gather(x_, at, (K + 1) * N, (t - 1) * N + i);
+            for (int j = 0; j < M; ++j) u[j] = gather(u_, at, K * M, (t - 1) * M + j);
+            V[0] += step(weights, x, u, h, s, next);
+            stage_terms(weights, s, u, Vx, h, F, l, H);
+            action_value(F, l, H, Vx, Vxx, Q, q);
+            for (int i = 0; i < M; ++i)
+                for (int j = 0; j < M; ++j) Quu[i][j] = Q[N + i][N + j] + (i == j ? reg : (lane){0});
+            positive &= boxed_newton(Quu, q + N, u, lb, ub, held, k, L);
+            feedback(L, Q, held, gain);
+            for (int j = 0; j < M; ++j) {
+                slope += k[j] * q[N + j];
+                for (int r = 0; r < M; ++r) curve += 0.5 * k[j] * Q[N + j][N + r] * k[r];
+                scatter(k_, at, K * M, (t - 1) * M + j, k[j]);
+                for (int i = 0; i < N; ++i) scatter(gain_, at, K * M * N, ((t - 1) * M + j) * N + i, gain[j][i]);
+            }
+            value_update(Q, q, k, gain, Vx, Vxx);
+        }
+        positive &= is_finite(slope) & is_finite(curve);
+        scatter(slope_, at, 1, 0, slope);
+        scatter(curve_, at, 1, 0, curve);
+        scatter(positive_, at, 1, 0, truth(positive));
+    }
+}

@@ -1,0 +1,232 @@
+"""Batched control-limited differential dynamic programming with exact second derivatives, in C generated from CasADi.
+
+Notation: z = (x, u); K RK4 intervals on [t0, T], u held on each, as NMPC has it; a problem of the batch is a pair
+(x0, t0). V, V_x, V_xx are the cost-to-go at the nodes and its derivatives, u + gain (x' - x) is the locally optimal
+feedback.
+
+Sources: Jacobson and Mayne, Differential Dynamic Programming (1970); Tassa, Mansard and Todorov, Control-limited
+differential dynamic programming, ICRA 2014.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nocl import checks
+from nocl.checks import Array
+from nocl.kernels import Kernel
+from nocl.ocp import OCP
+from nocl.solvers.ddp_kernel import ddp_source, pack_weights
+
+if TYPE_CHECKING:
+    from nocl.sysid import LearnedDynamics
+
+Rows = NDArray[np.int64]  # problem numbers
+
+
+@dataclass(frozen=True)
+class DDPSettings:
+    """When to stop, and how steps are damped."""
+
+    max_iterations: int = 200
+    tolerance: float = 1e-10  # stop when the predicted decrease of J is below tolerance * |J| + 1e-15
+    smallest_step: float = 2.0**-12  # of the line search
+    damping: float = 1e-4  # first mu added to Quu where a sweep or a line search fails
+    largest_damping: float = 1e8  # give up above it
+
+
+@dataclass(frozen=True, eq=False)
+class DDPSolution:
+    """Optimal trajectories from (x0, t0), with feedback and value derivatives at each node; rows [B, ...]."""
+
+    t: Array  # [B, K+1]
+    x: Array  # [B, K+1, nx]
+    u: Array  # [B, K, nu]
+    gain: Array  # [B, K, nu, nx], du/dx of the optimal feedback, 0 where a bound is active
+    V: Array  # [B, K+1]
+    V_x: Array  # [B, K+1, nx], the costate
+    V_xx: Array | None  # [B, K+1, nx, nx], where asked for
+    cost: Array  # [B], inf where the problem failed
+    success: NDArray[np.bool_]  # [B]
+    message: NDArray[np.str_]  # [B]
+    iterations: Rows  # [B]
+
+    def __len__(self) -> int:
+        return len(self.cost)
+
+    def __getitem__(self, rows: Any) -> DDPSolution:
+        """The solutions of some rows (a slice, a mask or indices)."""
+        picked: dict[str, Any] = {name: None if value is None else value[rows] for name, value in vars(self).items()}
+        return DDPSolution(**picked)
+
+    @staticmethod
+    def join(parts: Iterable[DDPSolution]) -> DDPSolution:
+        """Several batches as one."""
+        batches = [vars(p) for p in parts]
+        joined: dict[str, Any] = {name: None if first is None else np.concatenate([b[name] for b in batches])
+                                  for name, first in batches[0].items()}
+        return DDPSolution(**joined)
+
+
+class DDP:
+    """Solve batches of an OCP's problems from any (x0, t0); path constraints enter as the OCP's penalty.
+
+    Parameters
+    ----------
+    ocp : OCP
+    intervals : int
+        K, the number of RK4 steps and held controls on [t0, T].
+    dynamics : LearnedDynamics, optional
+        f_theta in place of the exact f; its networks' derivatives are generated C too.
+    threads : int, optional
+        Default: all cores.
+    cache : folder for compiled kernels, optional
+        Default: the folder that NOCL_CACHE names, or else one that goes with the process.
+    """
+
+    def __init__(self, ocp: OCP, *, intervals: int = 80, dynamics: LearnedDynamics | None = None,
+                 settings: DDPSettings | None = None, threads: int | None = None,
+                 cache: str | os.PathLike[str] | None = None) -> None:
+        if intervals < 1:
+            raise ValueError(f"DDP: intervals is {intervals}; expected at least 1")
+        self.ocp, self.intervals, self.settings = ocp, int(intervals), settings or DDPSettings()
+        self.threads = threads or os.cpu_count() or 1
+        net = None if dynamics is None else dynamics.net
+        self._weights = np.zeros(1) if net is None else pack_weights(net)
+        self._kernel = Kernel(ddp_source(ocp, net), cache)
+        self._lb, self._ub = np.ascontiguousarray(ocp.system.lbu), np.ascontiguousarray(ocp.system.ubu)
+
+    def solve(self, x0: ArrayLike, t0: ArrayLike = 0.0, *, u: Array | None = None, x: Array | None = None,
+              gain: Array | None = None, curvature: bool = False) -> DDPSolution:
+        """Descend from a guess u [B, K, nu] (default u*), followed with u + gain (x' - x) where x and gain are given.
+
+        Parameters
+        ----------
+        x0 : [nx] or [B, nx]
+        t0 : number or [B], each < horizon
+        curvature : whether to return V_xx
+        """
+        x0, _ = checks.states(x0, self.ocp.system.nx, self.ocp.system.name)
+        work = _Work(self, x0, self._start_times(t0, len(x0)), u, x, gain)
+        work.descend()
+        return work.solution(curvature)
+
+    def _start_times(self, t0: ArrayLike, B: int) -> Array:
+        times = np.broadcast_to(np.asarray(t0, dtype=np.float64), (B,)).copy()
+        bad = np.flatnonzero(~((times >= 0) & (times < self.ocp.horizon)))
+        if bad.size:
+            raise ValueError(f"t0[{bad[0]}] is {times[bad[0]]}; expected 0 <= t0 < horizon = {self.ocp.horizon}")
+        return times
+
+
+@dataclass
+class _Work:
+    """The state of a batch while it descends."""
+
+    ddp: DDP
+    x0: Array
+    t0: Array
+    guess_u: Array | None
+    guess_x: Array | None
+    guess_gain: Array | None
+    mu: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        ocp, B, K = self.ddp.ocp, len(self.x0), self.ddp.intervals
+        nx, nu = ocp.system.nx, ocp.system.nu
+        self.h = (ocp.horizon - self.t0) / K
+        self.x, self.u = np.zeros((B, K + 1, nx)), np.zeros((B, K, nu))
+        self.k, self.gain = np.zeros((B, K, nu)), np.zeros((B, K, nu, nx))
+        self.new_x, self.new_u, self.new_J = np.zeros_like(self.x), np.zeros_like(self.u), np.zeros(B)
+        self.slope, self.curve, self.positive = np.zeros(B), np.zeros(B), np.zeros(B)
+        self.mu, self.alpha, self.iterations = np.zeros(B), np.zeros(B), np.zeros(B, dtype=np.int64)
+        self.state = np.zeros(B, dtype=np.int64)  # an index of MESSAGES
+        u = _guess(self.guess_u, (B, K, nu), "u", np.broadcast_to(ocp.u_goal, (B, K, nu)))
+        x = _guess(self.guess_x, (B, K + 1, nx), "x", self.x)
+        gain = _guess(self.guess_gain, (B, K, nu, nx), "gain", self.gain)
+        self._rollout(np.arange(B), x, u, gain)
+        self.x[:], self.u[:], self.J = self.new_x, self.new_u, self.new_J.copy()
+        self.state[~np.isfinite(self.J)] = BLEW_UP
+
+    def _rollout(self, rows: Rows, x_bar: Array, u_bar: Array, gain: Array) -> None:
+        d = self.ddp
+        d._kernel("nocl_rollout", rows, d.intervals, d._weights, d._lb, d._ub, self.h, self.x0, x_bar, u_bar, self.k,
+                  gain, self.alpha, self.new_x, self.new_u, self.new_J, threads=d.threads)
+
+    def _backward(self, rows: Rows, V: Array | None = None, V_x: Array | None = None,
+                  V_xx: Array | None = None) -> None:
+        d = self.ddp
+        d._kernel("nocl_backward", rows, d.intervals, d._weights, d._lb, d._ub, self.h, self.x, self.u, self.mu, self.k,
+                  self.gain, self.slope, self.curve, self.positive, V, V_x, V_xx, threads=d.threads)
+
+    def descend(self) -> None:
+        s = self.ddp.settings
+        while (rows := np.flatnonzero(self.state == RUNNING)).size:
+            self.state[rows[self.iterations[rows] >= s.max_iterations]] = OUT_OF_ITERATIONS
+            self.iterations[rows] += 1
+            rows = rows[self.state[rows] == RUNNING]
+            self._backward(rows)
+            good = rows[self.positive[rows] > 0]
+            self._damp(rows[self.positive[rows] == 0])
+            small = -(self.slope[good] + self.curve[good]) <= s.tolerance * np.abs(self.J[good]) + 1e-15
+            self.state[good[small & (self.mu[good] == 0)]] = CONVERGED
+            self._relax(good[small])
+            self._line_search(good[~small])
+
+    def _line_search(self, rows: Rows) -> None:
+        """Halve each problem's step until J falls by a share of what was predicted; damp those that never do."""
+        self.alpha[rows] = 1.0
+        while rows.size:
+            self._rollout(rows, self.x, self.u, self.gain)
+            a = self.alpha[rows]
+            predicted = a * self.slope[rows] + a * a * self.curve[rows]
+            done = self.new_J[rows] - self.J[rows] <= 1e-3 * np.minimum(predicted, 0.0)  # False for NaN
+            won = rows[done]
+            self.x[won], self.u[won], self.J[won] = self.new_x[won], self.new_u[won], self.new_J[won]
+            self._relax(won[self.alpha[won] > 0.2])
+            rows = rows[~done]
+            self.alpha[rows] /= 2
+            stuck = self.alpha[rows] < self.ddp.settings.smallest_step
+            self._damp(rows[stuck])
+            rows = rows[~stuck]
+
+    def _damp(self, rows: Rows) -> None:
+        s = self.ddp.settings
+        self.mu[rows] = np.maximum(8 * self.mu[rows], s.damping)
+        self.state[rows[self.mu[rows] > s.largest_damping]] = NO_DESCENT
+
+    def _relax(self, rows: Rows) -> None:
+        mu = self.mu[rows] / 8
+        self.mu[rows] = np.where(mu < self.ddp.settings.damping, 0.0, mu)
+
+    def solution(self, curvature: bool) -> DDPSolution:
+        B, K = len(self.x0), self.ddp.intervals
+        nx = self.x.shape[2]
+        V, V_x = np.zeros((B, K + 1)), np.zeros((B, K + 1, nx))
+        V_xx = np.zeros((B, K + 1, nx, nx)) if curvature else None
+        self.mu[:] = 0
+        self._backward(np.arange(B), V, V_x, V_xx)
+        success = self.state == CONVERGED
+        t = self.t0[:, None] + self.h[:, None] * np.arange(K + 1)
+        return DDPSolution(t, self.x, self.u, self.gain, V, V_x, V_xx, np.where(success, self.J, np.inf), success,
+                           np.array(MESSAGES)[self.state], self.iterations)
+
+
+MESSAGES = ("running", "converged", "stopped at max_iterations", "no descent: the largest damping did not help",
+            "the starting guess blows up: its cost is not finite")
+RUNNING, CONVERGED, OUT_OF_ITERATIONS, NO_DESCENT, BLEW_UP = range(5)
+
+
+def _guess(value: Array | None, shape: tuple[int, ...], name: str, default: Array) -> Array:
+    if value is None:
+        return np.ascontiguousarray(default, dtype=np.float64)
+    array = np.ascontiguousarray(value, dtype=np.float64)
+    if array.shape != shape:
+        raise ValueError(f"DDP: the guess {name} has shape {array.shape}, expected {shape}")
+    return array
