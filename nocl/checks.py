@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numbers
 from collections.abc import Sequence
 from typing import Any
 
@@ -56,6 +57,39 @@ def bounds(lower: ArrayLike, upper: ArrayLike, n: int, names: tuple[str, str], o
     return lb, ub
 
 
+class FrozenSX(ca.SX):
+    """An SX that cannot be edited in place; what is computed from it is plain SX."""
+
+    def _refuse(self, *_: Any) -> Any:
+        raise TypeError("this expression belongs to a nocl.System or nocl.OCP and cannot be changed: "
+                        "edit a copy, ca.SX(...), and build a new one")
+
+    __setitem__: Any = _refuse
+    set: Any = _refuse
+    set_nz: Any = _refuse
+    clear: Any = _refuse
+    enlarge: Any = _refuse
+    erase: Any = _refuse
+    remove: Any = _refuse
+    resize: Any = _refuse
+
+
+def column(value: Any) -> Any:
+    """A list or tuple of SX as one SX column, other things as they are."""
+    if isinstance(value, (list, tuple)) and value and all(isinstance(v, (ca.SX, int, float)) for v in value):
+        return ca.vertcat(*value)
+    return value
+
+
+def number(value: Any, name: str, owner: str, positive: bool = False) -> float:
+    """A finite number >= 0 (> 0 where `positive`) as a float; raises ValueError otherwise."""
+    real = isinstance(value, numbers.Real) and not isinstance(value, bool)
+    if not real or not np.isfinite(value) or value < 0 or (positive and value == 0):
+        expected = "positive number" if positive else "number >= 0"
+        raise ValueError(f"{owner}: {name} is {value!r}; expected a finite {expected}")
+    return float(value)
+
+
 def symbols(value: Any, name: str, owner: str) -> list[ca.SX]:
     """The scalar symbols of a column of SX symbols; raises ValueError for anything else."""
     if not isinstance(value, ca.SX):
@@ -67,13 +101,18 @@ def symbols(value: Any, name: str, owner: str) -> list[ca.SX]:
     for i, part in enumerate(parts):
         if not part.is_symbolic():
             raise ValueError(f"{owner}: {name}[{i}] is the expression {part}; expected a plain symbol ca.SX.sym(...)")
+        if not part.name().strip():
+            raise ValueError(f"{owner}: {name}[{i}] is a symbol without a name; expected one, ca.SX.sym('theta')")
     return parts
 
 
-def expression(value: Any, rows: int, allowed: ca.SX, name: str, owner: str) -> ca.SX:
-    """A dense SX column of `rows` entries in the allowed symbols only; raises ValueError otherwise."""
-    if isinstance(value, (int, float)):
-        value = ca.SX(value)
+def expression(value: Any, rows: int, allowed: ca.SX, name: str, owner: str, controls: ca.SX | None = None) -> ca.SX:
+    """A dense SX column of `rows` entries in the allowed symbols only; raises ValueError otherwise.
+
+    `controls` are symbols that a user might well put there although they are not allowed: the error explains it.
+    """
+    if isinstance(value, (numbers.Real, ca.DM)):
+        value = ca.SX(ca.DM(value))
     if not isinstance(value, ca.SX):
         raise ValueError(f"{owner}: {name} is a {type(value).__name__}; expected a casadi.SX expression: "
                          f"build it from the system's SX symbols (MX is not accepted)")
@@ -81,12 +120,17 @@ def expression(value: Any, rows: int, allowed: ca.SX, name: str, owner: str) -> 
         raise ValueError(f"{owner}: {name} has shape {value.shape}, expected ({rows}, 1): "
                          f"{'one row per state, by ca.vertcat(...)' if rows > 1 else 'a scalar expression'}")
     free = [s for s in ca.symvar(value) if not ca.depends_on(s, allowed)]
+    used = [s.name() for s in free if controls is not None and ca.depends_on(s, controls)]
+    if used:
+        raise ValueError(f"{owner}: {name} contains the control(s) {', '.join(used)}, expected the states only: bound "
+                         f"controls by the system's lbu and ubu, and weigh them in the running cost")
     if free:
         names = ", ".join(sorted(s.name() for s in free))
         known = ", ".join(s.name() for s in ca.symvar(allowed))
         raise ValueError(f"{owner}: {name} contains the symbol(s) {names}, expected only the system's own ({known}): "
-                         f"put a number in their place, or use the very symbols given to the System")
-    return ca.densify(value)
+                         f"put a number in their place, or use the very symbols given to the System, not new "
+                         f"ones of the same name")
+    return FrozenSX(ca.densify(value))
 
 
 def states(x: ArrayLike, nx: int, owner: str, name: str = "x0") -> tuple[Array, bool]:

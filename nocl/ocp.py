@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from types import MappingProxyType
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from nocl import checks
-from nocl.checks import Vector
-from nocl.sampling import Distribution, Gaussian, Uniform
-from nocl.system import System, equations
+from nocl import checks, pretty, sampling, symbolic
+from nocl.checks import Array, Vector
+from nocl.sampling import Distribution, Gaussian, Uniform, short
+from nocl.system import System
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -58,14 +59,13 @@ class OCP:
             raise ValueError(f"OCP: system is a {type(self.system).__name__}; expected a nocl.System")
         s, owner = self.system, f"OCP on {self.system.name!r}"
         for name in ("horizon", "penalty", "penalty_margin"):
-            self._check_number(name, owner)
+            self._set(**{name: checks.number(getattr(self, name), name, owner, positive=name == "horizon")})
         z = ca.vertcat(s.x, s.u)
+        self._check_constraints(owner)
         self._set(running=checks.expression(self.running, 1, z, "running", owner),
-                  terminal=checks.expression(self.terminal, 1, s.x, "terminal", owner),
+                  terminal=checks.expression(self.terminal, 1, s.x, "terminal", owner, s.u),
                   x_goal=checks.vector(self.x_goal, s.nx, "x_goal", owner),
-                  u_goal=checks.vector(self.u_goal, s.nu, "u_goal", owner),
-                  path_constraints={name: checks.expression(h, 1, s.x, f"path constraint {name!r}", owner)
-                                    for name, h in dict(self.path_constraints).items()})
+                  u_goal=checks.vector(self.u_goal, s.nu, "u_goal", owner))
         self._check_goal(owner)
         self._check_initial_states(owner)
         self._check_finite(owner)
@@ -74,12 +74,14 @@ class OCP:
         for key, value in values.items():
             object.__setattr__(self, key, value)
 
-    def _check_number(self, name: str, owner: str) -> None:
-        value = getattr(self, name)
-        if isinstance(value, bool) or not isinstance(value, (int, float)) or not np.isfinite(value) or value < 0 \
-                or (name == "horizon" and value == 0):
-            raise ValueError(f"{owner}: {name} is {value!r}; expected a finite positive number")
-        self._set(**{name: float(value)})
+    def _check_constraints(self, owner: str) -> None:
+        if not isinstance(self.path_constraints, Mapping) or not all(isinstance(n, str) for n in self.path_constraints):
+            raise ValueError(f"{owner}: path_constraints is {self.path_constraints!r}; expected a dict from names to "
+                             "expressions that are >= 0 where they hold, {'wall': 2 - p}")
+        x, u = self.system.x, self.system.u
+        self._set(path_constraints=MappingProxyType(
+            {name: checks.expression(h, 1, x, f"path constraint {name!r}", owner, u)
+             for name, h in self.path_constraints.items()}))
 
     def _check_goal(self, owner: str) -> None:
         s = self.system
@@ -105,13 +107,21 @@ class OCP:
                              f"box [{s.lbx[i]:g}, {s.ubx[i]:g}]: move it or widen lbx, ubx")
 
     def _check_finite(self, owner: str) -> None:
+        """Try the costs, the constraints and their derivatives at the goal and at initial states, with u = u*."""
         s = self.system
-        x = np.vstack([self.initial_states.sample(64, 0), self.x_goal]).T
-        u = np.repeat(self.u_goal[:, None], x.shape[1], axis=1)
-        for what, values in (("running", self.L(x, u)), ("terminal", self.G(x)), ("a path constraint", self.h(x))):
-            if not np.isfinite(values.full()).all():
-                raise ValueError(f"{owner}: {what} gives NaN or inf at an initial state or at the goal; expected "
-                                 f"finite values for every state of the problem ({', '.join(s.state_names)})")
+        z = ca.vertcat(s.x, s.u)
+        x = np.vstack([self.x_goal, self.initial_states.sample(64, 0)]).T
+        at = np.vstack([x, np.repeat(self.u_goal[:, None], x.shape[1], axis=1)])
+        for what, value in [("running", self.running), ("terminal", self.terminal),
+                            *((f"path constraint {name!r}", h) for name, h in self.path_constraints.items())]:
+            hessian, gradient = ca.hessian(value, z)
+            for order, e in (("", value), ("the gradient of ", gradient), ("the second derivative of ", hessian)):
+                values = ca.Function("e", [z], [ca.vec(ca.densify(e))])(at).full()
+                bad = np.flatnonzero(~np.isfinite(values).all(axis=0))
+                if bad.size:
+                    where = "the goal" if bad[0] == 0 else "an initial state"
+                    raise ValueError(f"{owner}: {order}{what} gives NaN or inf at {where}, x = {short(x[:, bad[0]])}; "
+                                     "expected finite values: square a norm, or smooth it as sqrt(d^2 + 1e-6)")
 
     @classmethod
     def quadratic(cls, system: System, *, x_goal: Vector, u_goal: Vector, R: Vector = 0.01, P: Vector = 1.0,
@@ -123,8 +133,8 @@ class OCP:
         owner = f"OCP on {system.name!r}"
         du = system.u - ca.DM(checks.vector(u_goal, system.nu, "u_goal", owner))
         dx = system.x - ca.DM(checks.vector(x_goal, system.nx, "x_goal", owner))
-        return cls(system, running=ca.bilin(ca.DM(checks.weight(R, system.nu, "R", owner)), du, du),
-                   terminal=ca.bilin(ca.DM(checks.weight(P, system.nx, "P", owner)), dx, dx),
+        return cls(system, running=_quadratic(checks.weight(R, system.nu, "R", owner), du),
+                   terminal=_quadratic(checks.weight(P, system.nx, "P", owner), dx),
                    x_goal=x_goal, u_goal=u_goal, **options)
 
     @cached_property
@@ -152,9 +162,49 @@ class OCP:
         return ca.Function("L_soft", [self.system.x, self.system.u], [soft], ["x", "u"], ["L"])
 
     def __repr__(self) -> str:
-        lines = [f"OCP on {self.system.name!r}: horizon {self.horizon:g}",
-                 f"  L = {equations(self.running)[0]}", f"  G = {equations(self.terminal)[0]}",
-                 f"  goal x* = {self.x_goal.tolist()}, u* = {self.u_goal.tolist()}",
-                 f"  x0 ~ {self.initial_states}"]
-        lines += [f"  {name}: {equations(h)[0]} >= 0" for name, h in self.path_constraints.items()]
+        z = ca.vertcat(self.system.x, self.system.u)
+        values = ca.vertcat(self.running, self.terminal, *self.path_constraints.values())
+        (L, G, *constraints), shared = pretty.lines(values, z, prefix="c")
+        lines = [f"OCP on {self.system.name!r}: horizon {self.horizon:g}"]
+        lines += [pretty.wrapped("L", L), pretty.wrapped("G", G)]
+        lines += [pretty.filled(f"{name}: {h} >= 0")
+                  for name, h in zip(self.path_constraints, constraints, strict=True)]
+        lines += [pretty.wrapped(name, e, "    ") for name, e in shared.items()]
+        lines += [pretty.filled(f"goal: x* = {short(self.x_goal)}, u* = {short(self.u_goal)}"),
+                  pretty.filled(f"x0 ~ {self.initial_states!r}")]
         return "\n".join([*lines, repr(self.system)])
+
+    def to_data(self) -> dict[str, Any]:
+        """The problem with its system as plain JSON data, exact to the last bit."""
+        return {"system": self.system.to_data(), "horizon": self.horizon, "x_goal": self.x_goal.tolist(),
+                "u_goal": self.u_goal.tolist(), "initial_states": sampling.to_data(self.initial_states),
+                "L": symbolic.to_data(self.L), "G": symbolic.to_data(self.G), "h": symbolic.to_data(self.h),
+                "path_constraints": list(self.path_constraints),
+                "penalty": self.penalty, "penalty_margin": self.penalty_margin}
+
+    @staticmethod
+    def from_data(data: Mapping[str, Any]) -> OCP:
+        """The problem that to_data wrote, with new symbols; ValueError for anything else."""
+        try:
+            system = System.from_data(data["system"])
+            x, u = system.x, system.u
+            constraints = ca.vertsplit(symbolic.from_data(data["h"], [x])(x)) if data["path_constraints"] else []
+            return OCP(system, horizon=data["horizon"], x_goal=data["x_goal"], u_goal=data["u_goal"],
+                       running=symbolic.from_data(data["L"], [x, u])(x, u),
+                       terminal=symbolic.from_data(data["G"], [x])(x),
+                       initial_states=sampling.from_data(data["initial_states"]),
+                       path_constraints=dict(zip(data["path_constraints"], constraints, strict=True)),
+                       penalty=data["penalty"], penalty_margin=data["penalty_margin"])
+        except (KeyError, TypeError, AttributeError, NotImplementedError, RuntimeError) as error:
+            raise ValueError(f"not an OCP written by nocl: {type(error).__name__}: {error}") from error
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return OCP.from_data, (self.to_data(),)  # bare SX does not pickle
+
+
+def _quadratic(W: Array, e: ca.SX) -> ca.SX:
+    """e' W e, W symmetric."""
+    off = W - np.diag(np.diag(W))
+    squares = ca.dot(ca.DM(np.diag(W)), e**2)
+    return squares + ca.bilin(ca.DM(off), e, e) if off.any() else squares
+

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +20,12 @@ def _length(value: Vector, name: str, owner: str) -> int:
     return int(shape[0])
 
 
-@dataclass(frozen=True, eq=False)
+def short(vector: Array) -> str:
+    """A vector as text, six digits."""
+    return "[" + ", ".join(f"{v:.6g}" for v in vector) + "]"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Gaussian:
     """Independent normal coordinates: x_i ~ N(mean_i, std_i^2); std_i = 0 holds a coordinate fixed."""
 
@@ -45,8 +52,11 @@ class Gaussian:
         rng = np.random.default_rng(seed)
         return self.mean + self.std * rng.standard_normal((n, self.n))
 
+    def __repr__(self) -> str:
+        return f"Gaussian(mean={short(self.mean)}, std={short(self.std)})"
 
-@dataclass(frozen=True, eq=False)
+
+@dataclass(frozen=True, eq=False, repr=False)
 class Uniform:
     """Independent uniform coordinates: x_i ~ U[lb_i, ub_i]; lb_i = ub_i holds a coordinate fixed."""
 
@@ -74,5 +84,26 @@ class Uniform:
         rng = np.random.default_rng(seed)
         return rng.uniform(self.lb, self.ub, (n, self.n))
 
+    def __repr__(self) -> str:
+        return f"Uniform(lb={short(self.lb)}, ub={short(self.ub)})"
+
 
 Distribution = Gaussian | Uniform
+
+
+def to_data(distribution: Distribution) -> dict[str, Any]:
+    """A distribution as plain JSON data."""
+    fields = {"mean": distribution.mean, "std": distribution.std} if isinstance(distribution, Gaussian) else \
+        {"lb": distribution.lb, "ub": distribution.ub}
+    return {"kind": type(distribution).__name__, **{name: value.tolist() for name, value in fields.items()}}
+
+
+def from_data(data: Mapping[str, Any]) -> Distribution:
+    """The distribution that to_data wrote; ValueError for anything else."""
+    kinds: dict[Any, Any] = {"Gaussian": Gaussian, "Uniform": Uniform}
+    fields = dict(data)
+    kind = fields.pop("kind", None)
+    if kind not in kinds:
+        raise ValueError(f"the kind of a distribution is {kind!r}; expected {' or '.join(kinds)}")
+    distribution: Distribution = kinds[kind](**fields)
+    return distribution

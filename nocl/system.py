@@ -6,12 +6,14 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from types import MappingProxyType
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nocl import checks
+from nocl import checks, pretty, symbolic
 from nocl.checks import Array, Vector
 
 N_PROBES = 512  # points of the box at which the equations are tried on construction
@@ -58,13 +60,15 @@ class System:
         if not isinstance(self.name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", self.name):
             raise ValueError(f"System: name is {self.name!r}; expected letters, digits and _, like 'cart_pole'")
         owner = f"System {self.name!r}"
-        checks.symbols(self.x, "x", owner), checks.symbols(self.u, "u", owner)
-        self._set(x=ca.SX(self.x), u=ca.SX(self.u))  # copies: the caller may go on editing its own
+        for name in ("x", "u"):  # copies: the caller may go on editing its own
+            parts = checks.symbols(checks.column(getattr(self, name)), name, owner)
+            self._set(**{name: checks.FrozenSX(ca.vertcat(*parts))})
         repeated = sorted({n for n in self.names if self.names.count(n) > 1})
         if repeated:
-            raise ValueError(f"{owner}: the name(s) {', '.join(repeated)} stand for several symbols; "
-                             "expected a name of its own for each state and control")
-        self._set(xdot=checks.expression(self.xdot, self.nx, ca.vertcat(self.x, self.u), "xdot", owner))
+            raise ValueError(f"{owner}: {', '.join(repeated)} occurs more than once in x and u; "
+                             "expected a symbol and a name of its own for each state and control")
+        z = ca.vertcat(self.x, self.u)
+        self._set(xdot=checks.expression(checks.column(self.xdot), self.nx, z, "xdot", owner))
         lbu, ubu = checks.bounds(self.lbu, self.ubu, self.nu, ("lbu", "ubu"), owner, self.control_names)
         lbx, ubx = checks.bounds(self.lbx, self.ubx, self.nx, ("lbx", "ubx"), owner, self.state_names)
         self._set(lbu=lbu, ubu=ubu, lbx=lbx, ubx=ubx)
@@ -79,17 +83,17 @@ class System:
         angles = (self.angles,) if isinstance(self.angles, str) else tuple(self.angles)
         unknown = [a for a in angles if a not in self.state_names]
         if unknown:
-            raise ValueError(f"{owner}: angles names {unknown}; expected names of states ({', '.join(self.state_names)})")
+            raise ValueError(f"{owner}: angles has {unknown}; expected names of states ({', '.join(self.state_names)})")
         unknown = [n for n in self.units if n not in self.names]
         if unknown:
-            raise ValueError(f"{owner}: units names {unknown}; expected names of states or controls ({', '.join(self.names)})")
-        self._set(angles=angles, units=dict(self.units))
+            raise ValueError(f"{owner}: units has {unknown}; expected names of states or controls ({', '.join(self.names)})")
+        self._set(angles=angles, units=MappingProxyType(dict(self.units)))
 
     def _check_finite(self, owner: str) -> None:
-        """Try f and its Jacobian at the corners' middle, the bounds and random points of the box."""
+        """Try f and its Jacobian at the box's middle, its two extreme corners and random points."""
         rng = np.random.default_rng(0)
         lb, ub = np.r_[self.lbx, self.lbu], np.r_[self.ubx, self.ubu]
-        z = np.vstack([lb, ub, rng.uniform(lb, ub, (N_PROBES, len(lb)))]).T
+        z = np.vstack([(lb + ub) / 2, lb, ub, rng.uniform(lb, ub, (N_PROBES, len(lb)))]).T
         x, u = z[: self.nx], z[self.nx:]
         values = np.vstack([self.f(x, u).full(), *(_stack(j, z.shape[1]) for j in self.jacobian(x, u))])
         bad = np.flatnonzero(~np.isfinite(values).all(axis=0))
@@ -158,16 +162,38 @@ class System:
         def interval(name: str, low: float, high: float) -> str:
             return f"{name} in [{low:g}, {high:g}]" + (" (angle)" if name in self.angles else "")
 
-        lines = [f"System {self.name!r}: {self.nx} states, {self.nu} controls"]
-        lines += [f"  d {n}/dt = {e}" for n, e in zip(self.state_names, equations(self.xdot), strict=True)]
-        lines.append("  X: " + ", ".join(map(interval, self.state_names, self.lbx, self.ubx)))
-        lines.append("  U: " + ", ".join(map(interval, self.control_names, self.lbu, self.ubu)))
+        rows, shared = pretty.lines(self.xdot, ca.vertcat(self.x, self.u))
+        lines = [f"System {self.name!r}: {counted(self.nx, 'state')}, {counted(self.nu, 'control')}"]
+        lines += [pretty.wrapped(f"d{n}/dt", e) for n, e in zip(self.state_names, rows, strict=True)]
+        lines += [pretty.wrapped(name, e, "    ") for name, e in shared.items()]
+        lines.append(pretty.filled("X: " + ", ".join(map(interval, self.state_names, self.lbx, self.ubx))))
+        lines.append(pretty.filled("U: " + ", ".join(map(interval, self.control_names, self.lbu, self.ubu))))
         return "\n".join(lines)
 
+    def to_data(self) -> dict[str, Any]:
+        """The system as plain JSON data, exact to the last bit."""
+        return {"name": self.name, "x": list(self.state_names), "u": list(self.control_names),
+                "f": symbolic.to_data(self.f), "angles": list(self.angles), "units": dict(self.units),
+                **{name: getattr(self, name).tolist() for name in ("lbu", "ubu", "lbx", "ubx")}}
 
-def equations(expression: ca.SX) -> list[str]:
-    """Each row of an SX column as text; shared subexpressions of long ones are written as CasADi's @1, @2, ..."""
-    return [str(row) for row in ca.vertsplit(expression)]
+    @staticmethod
+    def from_data(data: Mapping[str, Any]) -> System:
+        """The system that to_data wrote, with new symbols; ValueError for anything else."""
+        try:
+            x, u = (ca.vertcat(*map(ca.SX.sym, data[names])) for names in ("x", "u"))
+            xdot = symbolic.from_data(data["f"], [x, u])(x, u)
+            return System(data["name"], x=x, u=u, xdot=xdot, angles=data["angles"], units=data["units"],
+                          **{name: data[name] for name in ("lbu", "ubu", "lbx", "ubx")})
+        except (KeyError, TypeError, AttributeError, NotImplementedError, RuntimeError) as error:
+            raise ValueError(f"not a System written by nocl: {type(error).__name__}: {error}") from error
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return System.from_data, (self.to_data(),)  # bare SX does not pickle
+
+
+def counted(n: int, noun: str) -> str:
+    """'1 state', '2 states'."""
+    return f"{n} {noun}" + ("s" if n != 1 else "")
 
 
 def _stack(matrix: ca.DM, columns: int) -> Array:

@@ -26,8 +26,8 @@ def system(
 ) -> nocl.System:
     """x = [th1, th2, w1, w2]: th1 = 0 hangs down, th2 is relative to link 1; u1 drives joint 2, u2 brakes joint 1."""
     th1, th2, w1, w2, u1, u2 = (ca.SX.sym(name) for name in ("th1", "th2", "w1", "w2", "u1", "u2"))
-    d1 = m1 * lc1**2 + m2 * (l1**2 + lc2**2 + 2 * l1 * lc2 * ca.cos(th2)) + I1 + I2
-    d2 = m2 * (lc2**2 + l1 * lc2 * ca.cos(th2)) + I2
+    d1 = m1 * lc1**2 + m2 * (l1**2 + lc2**2) + I1 + I2 + 2 * m2 * l1 * lc2 * ca.cos(th2)
+    d2 = m2 * lc2**2 + I2 + m2 * l1 * lc2 * ca.cos(th2)
     phi2 = m2 * lc2 * g * ca.sin(th1 + th2)  # the book's cos(th1 + th2 - pi/2)
     phi1 = (-m2 * l1 * lc2 * w2 * (w2 + 2 * w1) * ca.sin(th2) + (m1 * lc1 + m2 * l1) * g * ca.sin(th1) + phi2)
     dw2 = (u1 + d2 / d1 * phi1 - m2 * l1 * lc2 * w1**2 * ca.sin(th2) - phi2) / (m2 * lc2**2 + I2 - d2**2 / d1)
