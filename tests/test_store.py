@@ -182,7 +182,8 @@ def test_training_resumes_exactly_from_a_checkpoint(tmp_path):
 def test_checkpoints_keep_types_and_nesting(tmp_path):
     shared = torch.arange(6.0).reshape(2, 3)
     state = {"list": [shared, shared.T, None], 0: (1, 2.5, True, "x"), "array": np.arange(4, dtype=np.int16),
-             "s": np.float32(0.1), "empty": {}, "zero": torch.zeros(0, 3), "scalar": torch.tensor(7), "big": 2**127 + 1, "inf": float("-inf")}
+             "s": np.float32(0.1), "empty": {}, "zero": torch.zeros(0, 3), "scalar": torch.tensor(7),
+             "big": 2**127 + 1, "inf": float("-inf")}
     again, _ = store.load_checkpoint(store.save_checkpoint(tmp_path / "c", state))
     assert list(again) == list(state)
     assert torch.equal(again["list"][1], shared.T)
