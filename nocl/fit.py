@@ -1,0 +1,190 @@
+"""Fitting one small network to values and derivatives: SOAP on batches, then Levenberg-Marquardt.
+
+The network has two hidden sine layers and a linear skip; a bias is a weight of a constant input, so that three
+matrices W1 [h, F+1], W2 [h, h+1], W3 [m, h+1+F] hold everything. Its derivatives along k directions are propagated
+beside the value ("tangents"): a row of a batch is the value and k tangents, 1 + k rows of every matrix product.
+Shapes: N samples, B rows of a batch, F features, m outputs, k directions of the v variables, P parameters.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+Weights = list[Tensor]  # W1, W2, W3
+Report = Callable[[float], None]  # called once a step with the root mean square of the scaled residuals
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Features and the labels to meet, each as value and k tangents."""
+
+    phi: Tensor  # [1+k, B, F]
+    y: Tensor  # [1+k, B, m]
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Labelled samples; feature f depends on variable owner[f] alone, with the given slope. dy None: values only."""
+
+    phi: Tensor  # [N, F]
+    slope: Tensor  # [N, F], d phi_f / d variable owner[f]
+    owner: Tensor  # [F]
+    y: Tensor  # [N, m]
+    dy: Tensor | None  # [N, m, v]
+
+    def __len__(self) -> int:
+        return len(self.y)
+
+    def to(self, dtype: torch.dtype) -> Samples:
+        dy = None if self.dy is None else self.dy.to(dtype)
+        return Samples(self.phi.to(dtype), self.slope.to(dtype), self.owner, self.y.to(dtype), dy)
+
+    def batch(self, rows: Tensor, directions: Tensor) -> Batch:
+        """The samples at these rows, with tangents along directions [k, v]."""
+        phi, y = self.phi[rows], self.y[rows]
+        if self.dy is None or not len(directions):
+            return Batch(phi[None], y[None])
+        q = directions.to(phi.dtype)
+        tangents = self.slope[rows] * q[:, None, self.owner]  # [k, B, F]
+        derivatives = torch.einsum("bmv,kv->kbm", self.dy[rows], q)
+        return Batch(torch.cat([phi[None], tangents]), torch.cat([y[None], derivatives]))
+
+
+def initial(n_features: int, width: int, samples: Samples, generator: torch.Generator) -> Weights:
+    """Random hidden layers, the linear skip and the offset by least squares, nothing else in the output. float32"""
+    h = width
+    W1 = torch.randn(h, n_features + 1, generator=generator) * (1.5 / math.sqrt(n_features))
+    W2 = torch.randn(h, h + 1, generator=generator) / math.sqrt(h)
+    some = slice(0, 20_000)
+    phi = torch.cat([samples.phi[some], torch.ones(len(samples.phi[some]), 1, dtype=samples.phi.dtype)], 1).double()
+    c = torch.linalg.lstsq(phi, samples.y[some].double(), driver="gelsd").solution.float()
+    W3 = torch.cat([torch.zeros(c.shape[1], h), c[-1:].T, c[:-1].T], 1)
+    return [W1, W2, W3]
+
+
+def forward(weights: Sequence[Tensor], phi: Tensor) -> Tensor:
+    """Value and tangents [1+k, B, m] of the network from those of its features [1+k, B, F]."""
+    W1, W2, W3 = weights
+    F, h = phi.shape[-1], W1.shape[0]
+    a = _sine(phi @ W1[:, :F].T, W1[:, F])
+    a = _sine(a @ W2[:, :h].T, W2[:, h])
+    y = a @ W3[:, :h].T + phi @ W3[:, h + 1:].T
+    return torch.cat([y[:1] + W3[:, h], y[1:]])
+
+
+def _sine(z: Tensor, bias: Tensor) -> Tensor:
+    first = z[:1] + bias
+    return torch.cat([torch.sin(first), torch.cos(first) * z[1:]])
+
+
+def loss(weights: Sequence[Tensor], batch: Batch, scale: Tensor) -> Tensor:
+    """Sum over value and tangents and outputs of the mean square of (residual * scale [1+k, 1, m])."""
+    return ((forward(weights, batch.phi) - batch.y) * scale).square().mean(dim=1).sum()
+
+
+Draw = Callable[[int], tuple[Batch, Tensor]]  # batch size -> a fresh batch and the scale of its residuals
+
+
+def soap(weights: Weights, draw: Draw, *, iterations: int, batch: int, lr: float, report: Report) -> Weights:
+    """Adam in Shampoo's eigenbases (Vyas et al. 2024), cosine schedule with 50 steps of warm-up; new weights."""
+    from pytorch_optimizer import SOAP
+
+    own = [w.detach().clone().requires_grad_() for w in weights]
+    if not iterations:
+        return [w.detach() for w in own]
+    optimizer = SOAP(own, lr=lr, weight_decay=0.0)
+    for i in range(iterations):
+        optimizer.param_groups[0]["lr"] = lr * min(1.0, (i + 1) / 50) * _cosine(i / iterations)
+        value = loss(own, *draw(batch))
+        for w, g in zip(own, torch.autograd.grad(value, own), strict=True):
+            w.grad = g
+        optimizer.step()
+        report(float(value.detach()) ** 0.5)
+    return [w.detach() for w in own]
+
+
+def _cosine(progress: float) -> float:
+    return 0.5 * (1 + math.cos(math.pi * progress)) + 1e-3
+
+
+def levenberg_marquardt(weights: Weights, draw: Draw, *, steps: int, batch: int, report: Report) -> Weights:
+    """Damped Gauss-Newton steps, each on a fresh batch and kept only if it lowers the loss there; float64 weights.
+
+    The damping is in units of the diagonal of J'J: x 0.2 on success, x 4 on failure.
+    """
+    weights, damping = [w.detach().double() for w in weights], 1e-4
+    for _ in range(steps):
+        now, scale = draw(batch)
+        JJ, Jr, before = gauss_newton(weights, now, scale)
+        for _ in range(8):
+            candidate = _step(weights, JJ, Jr, damping)
+            after = float(loss(candidate, now, scale)) if candidate is not None else math.inf
+            if candidate is not None and after < before:
+                weights, damping = candidate, max(0.2 * damping, 1e-12)
+                break
+            damping = min(4 * damping, 1e6)
+        report(min(before, after) ** 0.5)
+    return weights
+
+
+def _step(weights: Weights, JJ: Tensor, Jr: Tensor, damping: float) -> Weights | None:
+    """The weights after one damped step, or None where the damped J'J is not positive definite in float64."""
+    damped = JJ.clone()
+    diagonal = JJ.diagonal()
+    damped.diagonal().add_(damping * (diagonal + 1e-9 * diagonal.max()))
+    factor, info = torch.linalg.cholesky_ex(damped)
+    if int(info):
+        return None
+    delta = torch.cholesky_solve(Jr[:, None], factor)[:, 0]
+    parts = delta.split([w.numel() for w in weights])
+    return [w - d.view_as(w) for w, d in zip(weights, parts, strict=True)]
+
+
+def gauss_newton(weights: Sequence[Tensor], batch: Batch, scale: Tensor,
+                 chunk: int = 512) -> tuple[Tensor, Tensor, float]:
+    """(J'J [P, P], J'r [P], r'r) over the batch, divided by B: J in float32, the residual r and the sums in float64."""
+    r = (forward([w.double() for w in weights], batch.phi.double()) - batch.y) * scale  # [1+k, B, m]
+    single, P, B = [w.float() for w in weights], sum(w.numel() for w in weights), r.shape[1]
+    JJ, Jr = torch.zeros(P, P, dtype=torch.float64), torch.zeros(P, dtype=torch.float64)
+    for start in range(0, B, chunk):
+        rows = slice(start, start + chunk)
+        J = parameter_jacobian(single, batch.phi[:, rows].float()).mul_(scale.float()[..., None]).view(-1, P)
+        JJ += (J.T @ J).double()
+        Jr += (J.T @ r[:, rows].reshape(-1).float()).double()
+    return JJ / B, Jr / B, float(r.square().sum() / B)
+
+
+def parameter_jacobian(weights: Sequence[Tensor], phi: Tensor) -> Tensor:
+    """d forward / d(W1, W2, W3), each flattened by rows: [1+k, B, m, P], by reverse mode written out."""
+    W1, W2, W3 = weights
+    (D, B, F), h, m = phi.shape, W1.shape[0], W3.shape[0]
+    one = torch.zeros(D, B, 1, dtype=phi.dtype)
+    one[0] = 1
+    t1 = phi @ W1[:, :F].T
+    s1, c1 = torch.sin(t1[0] + W1[:, F]), torch.cos(t1[0] + W1[:, F])
+    a1 = torch.cat([s1[None], c1 * t1[1:]])  # [D, B, h], the tangents' last
+    t2 = a1 @ W2[:, :h].T
+    s2, c2 = torch.sin(t2[0] + W2[:, h]), torch.cos(t2[0] + W2[:, h])
+    a2 = torch.cat([s2[None], c2 * t2[1:]])
+    in1, in2, in3 = torch.cat([phi, one], 2), torch.cat([a1, one], 2), torch.cat([a2, one, phi], 2)
+    J = torch.zeros(D, B, m, sum(w.numel() for w in weights), dtype=phi.dtype)
+    J1, J2, J3 = J.split([w.numel() for w in weights], dim=3)
+    J1, J2, J3 = J1.view(D, B, m, h, F + 1), J2.view(D, B, m, h, h + 1), J3.view(D, B, m, m, h + 1 + F)
+    for o in range(m):
+        J3[:, :, o, o] = in3
+        mu2 = W3[o, :h] * c2  # adjoint of the value (or of the tangent) before the second sine
+        back = mu2 @ W2[:, :h]
+        mu1 = back * c1
+        J1[:, :, o] = mu1[:, :, None] * in1[:, :, None, :]
+        J2[:, :, o] = mu2[:, :, None] * in2[:, :, None, :]
+        for d in range(1, D):  # a tangent's residual moves with the value before each sine as well
+            nu2 = -W3[o, :h] * s2 * t2[d]
+            nu1 = (nu2 @ W2[:, :h]) * c1 - back * s1 * t1[d]
+            J1[d, :, o] += nu1[:, :, None] * in1[0][:, None, :]
+            J2[d, :, o] += nu2[:, :, None] * in2[0][:, None, :]
+    return J
