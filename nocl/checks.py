@@ -112,7 +112,7 @@ def expression(value: Any, rows: int, allowed: ca.SX, name: str, owner: str, con
     `controls` are symbols that a user might well put there although they are not allowed: the error explains it.
     """
     if isinstance(value, (numbers.Real, ca.DM)):
-        value = ca.SX(ca.DM(value))
+        value = ca.SX(value if isinstance(value, ca.DM) else float(value))
     if not isinstance(value, ca.SX):
         raise ValueError(f"{owner}: {name} is a {type(value).__name__}; expected a casadi.SX expression: "
                          f"build it from the system's SX symbols (MX is not accepted)")

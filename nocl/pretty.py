@@ -41,11 +41,12 @@ class Text(NamedTuple):
         return f"({self.text})" if self.level > level or (strict and self.level == level) else self.text
 
 
-def lines(expression: ca.SX, symbols: ca.SX, prefix: str = "s") -> tuple[list[str], dict[str, str]]:
+def lines(expression: ca.SX, symbols: ca.SX, prefix: str = "s", digits: int = 6) -> tuple[list[str], dict[str, str]]:
     """(the rows of a column as text, the names of shared subexpressions in them with their texts, in order)."""
     expression = ca.densify(expression)
     function = ca.Function("f", [symbols], [expression])
-    taken = {s.name() for s in ca.vertsplit(symbols)}
+    names = [s.name() for s in ca.vertsplit(symbols)]
+    taken = set(names)
     rows, shared = [""] * expression.numel(), dict[str, str]()
     uses = _uses(function)
     slots: dict[int, Text] = {}
@@ -53,7 +54,7 @@ def lines(expression: ca.SX, symbols: ca.SX, prefix: str = "s") -> tuple[list[st
         if step.op == "OP_OUTPUT":
             rows[step.out[1]] = slots[step.args[0]].text
             continue
-        text = _write(step, slots, [s.name() for s in ca.vertsplit(symbols)])
+        text = _write(step, slots, names, digits)
         if uses[k] > 1 and len(text.text) >= SHARED:
             name = next(n for i in range(1, len(taken) + 2) if (n := f"{prefix}{i}") not in taken)
             taken.add(name)
@@ -74,11 +75,11 @@ def _uses(function: ca.Function) -> Counter[int]:
     return uses
 
 
-def _write(step: Instruction, slots: dict[int, Text], names: list[str]) -> Text:
+def _write(step: Instruction, slots: dict[int, Text], names: list[str], digits: int) -> Text:
     if step.op == "OP_INPUT":
         return Text(names[step.args[1]], _ATOM)
     if step.op == "OP_CONST":
-        return Text(f"{step.value:.6g}", _SUM if step.value < 0 else _ATOM)
+        return Text(f"{step.value:.{digits}g}", _SUM if step.value < 0 else _ATOM)
     args = [slots[i] for i in step.args]
     if step.op in _INFIX:
         return _infix(step.op, *args)

@@ -14,7 +14,10 @@ Seed = int | np.random.Generator
 
 
 def _length(value: Vector, name: str, owner: str) -> int:
-    shape = np.shape(value)
+    try:
+        shape = np.shape(value)
+    except ValueError:
+        raise ValueError(f"{owner}: {name} is {value!r}; expected a vector: pass one number per state") from None
     if len(shape) != 1 or shape[0] == 0:
         raise ValueError(f"{owner}: {name} has shape {shape}, expected a vector: pass one number per state")
     return int(shape[0])

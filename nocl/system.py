@@ -80,13 +80,14 @@ class System:
             object.__setattr__(self, key, value)
 
     def _check_names(self, owner: str) -> None:
-        angles = (self.angles,) if isinstance(self.angles, str) else tuple(self.angles)
-        unknown = [a for a in angles if a not in self.state_names]
-        if unknown:
-            raise ValueError(f"{owner}: angles has {unknown}; expected names of states ({', '.join(self.state_names)})")
-        unknown = [n for n in self.units if n not in self.names]
-        if unknown:
-            raise ValueError(f"{owner}: units has {unknown}; expected names of states or controls ({', '.join(self.names)})")
+        angles = (self.angles,) if isinstance(self.angles, str) else self.angles
+        if not isinstance(angles, (list, tuple)) or any(a not in self.state_names for a in angles):
+            raise ValueError(f"{owner}: angles is {self.angles!r}; expected a list of names of states "
+                             f"({', '.join(self.state_names)})")
+        angles = tuple(a for a in self.state_names if a in angles)
+        if not isinstance(self.units, Mapping) or any(n not in self.names for n in self.units):
+            raise ValueError(f"{owner}: units is {self.units!r}; expected a dict from names of states and controls "
+                             f"({', '.join(self.names)}) to units")
         self._set(angles=angles, units=MappingProxyType(dict(self.units)))
 
     def _check_finite(self, owner: str) -> None:

@@ -24,7 +24,7 @@ def system(
     g: float = 9.8,  # m/s^2
     u_max: float = 5.0,  # N m, |u1|, |u2| <= u_max
 ) -> nocl.System:
-    """x = [th1, th2, w1, w2]: th1 = 0 hangs down, th2 is relative to link 1; u1 drives joint 2, u2 brakes joint 1."""
+    """x = [th1, th2, w1, w2]: th1 = 0 hangs down, th2 is relative to link 1; u1 turns joint 2, -u2 joint 1."""
     th1, th2, w1, w2, u1, u2 = (ca.SX.sym(name) for name in ("th1", "th2", "w1", "w2", "u1", "u2"))
     d1 = m1 * lc1**2 + m2 * (l1**2 + lc2**2) + I1 + I2 + 2 * m2 * l1 * lc2 * ca.cos(th2)
     d2 = m2 * lc2**2 + I2 + m2 * l1 * lc2 * ca.cos(th2)
