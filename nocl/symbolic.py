@@ -8,6 +8,12 @@ from typing import Any, NamedTuple
 import casadi as ca
 
 OPERATIONS = {getattr(ca, name): name for name in dir(ca) if name.startswith("OP_")}
+_UNARY = ("ASSIGN NEG EXP LOG SQRT SQ TWICE SIN COS TAN ASIN ACOS ATAN NOT FLOOR CEIL FABS SIGN ERF INV "
+          "SINH COSH TANH ASINH ACOSH ATANH ERFINV LOG1P EXPM1")
+_BINARY = ("ADD SUB MUL DIV POW CONSTPOW LT LE EQ NE AND OR FMOD REMAINDER COPYSIGN IF_ELSE_ZERO FMIN FMAX ATAN2 "
+           "HYPOT LIFT PRINTME")
+UNARY = frozenset(f"OP_{name}" for name in _UNARY.split())
+BINARY = frozenset(f"OP_{name}" for name in _BINARY.split())  # with UNARY: every operation on scalars
 
 
 class Instruction(NamedTuple):
@@ -20,12 +26,21 @@ class Instruction(NamedTuple):
 
 
 def expand(function: ca.Function) -> ca.Function:
-    """The same function as SX with dense inputs and outputs; MX is expanded."""
+    """The same function as SX with dense inputs and outputs; MX is expanded, ValueError where that is impossible."""
+    name = function.name()
+    if function.has_free():
+        raise ValueError(f"{name} has the free symbols {', '.join(map(str, function.get_free()))}, expected none: "
+                         f"make them inputs of {name}, or put numbers in their place")
     if not function.is_a("SXFunction"):
-        function = function.expand()
+        try:
+            function = function.expand()
+        except RuntimeError as error:
+            reason = str(error).strip().splitlines()[-1]
+            raise ValueError(f"{name} cannot be written in SX, expected elementary operations only: replace externals, "
+                             f"integrators, linear solvers and table look-ups in it ({reason})") from None
     args = [ca.SX.sym(f"{function.name_in(i)}_", *function.size_in(i)) for i in range(function.n_in())]
     results = [ca.densify(r) for r in function.call(args)]
-    return ca.Function(function.name(), args, results, function.name_in(), function.name_out())
+    return ca.Function(name, args, results, function.name_in(), function.name_out())
 
 
 def instructions(function: ca.Function) -> Iterator[Instruction]:
@@ -37,8 +52,15 @@ def instructions(function: ca.Function) -> Iterator[Instruction]:
 
 
 def to_data(function: ca.Function) -> dict[str, Any]:
-    """A function as JSON data that any version of CasADi can read back, exactly (constants as hex floats)."""
+    """A function as JSON data that any version of CasADi can read back, exactly (constants as hex floats).
+
+    Raises ValueError for a function that is not made of operations on scalars.
+    """
     function = expand(function)
+    for i in instructions(function):
+        if i.op not in UNARY | BINARY | {"OP_INPUT", "OP_CONST", "OP_OUTPUT"}:
+            raise ValueError(f"{function.name()} contains {i.op}, expected operations on scalars only: "
+                             "replace calls of other functions (table look-ups, never_inline) in it")
     code = [[i.op, *i.out, *i.args] if i.op != "OP_CONST" else [i.op, *i.out, float(i.value).hex()]
             for i in instructions(function)]
     return {"name": function.name(), "work": function.sz_w(), "code": code,
@@ -55,7 +77,8 @@ def from_data(data: Mapping[str, Any], inputs: list[ca.SX] | None = None) -> ca.
         symbols = inputs or [ca.SX.sym(name, *size) for name, *size in data["inputs"]]
         outputs = [ca.SX.zeros(*size) for _, *size in data["outputs"]]
         _run(data["code"], [ca.SX(0)] * int(data["work"]), symbols, outputs)
-        return ca.Function(data["name"], symbols, outputs, [i[0] for i in data["inputs"]], [o[0] for o in data["outputs"]])
+        names_in, names_out = ([name for name, *_ in data[key]] for key in ("inputs", "outputs"))
+        return ca.Function(data["name"], symbols, outputs, names_in, names_out)
     except (KeyError, IndexError, TypeError, AttributeError, RuntimeError) as error:
         raise ValueError(f"not a function written by nocl: {type(error).__name__}: {error}") from error
 
@@ -68,9 +91,9 @@ def _run(code: list[list[Any]], work: list[ca.SX], inputs: list[ca.SX], outputs:
             outputs[args[0]].nz[args[1]] = work[args[2]]
         elif op == "OP_CONST":
             work[args[0]] = ca.SX(float.fromhex(args[1]))
-        elif not op.startswith("OP_"):
-            raise ValueError(f"{op!r} is not an operation of CasADi's")
-        elif len(args) == 2:
+        elif op in UNARY:
             work[args[0]] = ca.SX.unary(getattr(ca, op), work[args[1]])
-        else:
+        elif op in BINARY:
             work[args[0]] = ca.SX.binary(getattr(ca, op), work[args[1]], work[args[2]])
+        else:
+            raise ValueError(f"{op!r} is not an operation on scalars")

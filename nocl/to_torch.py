@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -10,13 +11,13 @@ import casadi as ca
 import torch
 from torch import Tensor
 
-from nocl.symbolic import expand, instructions
+from nocl.symbolic import UNARY, expand, instructions
 
 # Python source of each operation on tensors or floats {0}, {1}. CasADi's values and derivative conventions hold:
 # fmin and fmax ignore NaN and share the derivative at ties; sign, floor, ceil and comparisons have derivative 0.
 FLOAT_OPS = {
     "OP_ADD": "{0} + {1}", "OP_SUB": "{0} - {1}", "OP_MUL": "{0} * {1}", "OP_DIV": "{0} / {1}", "OP_NEG": "-{0}",
-    "OP_EXP": "{0}.exp()", "OP_LOG": "{0}.log()", "OP_POW": "{0} ** {1}", "OP_CONSTPOW": "{0} ** {1}",
+    "OP_EXP": "{0}.exp()", "OP_LOG": "{0}.log()", "OP_POW": "power({0}, {1})", "OP_CONSTPOW": "{0} ** {1}",
     "OP_SQRT": "{0}.sqrt()", "OP_SQ": "{0} * {0}", "OP_TWICE": "{0} * 2.0", "OP_INV": "{0}.reciprocal()",
     "OP_SIN": "{0}.sin()", "OP_COS": "{0}.cos()", "OP_TAN": "{0}.tan()",
     "OP_ASIN": "{0}.asin()", "OP_ACOS": "{0}.acos()", "OP_ATAN": "{0}.atan()",
@@ -24,49 +25,93 @@ FLOAT_OPS = {
     "OP_ASINH": "{0}.asinh()", "OP_ACOSH": "{0}.acosh()", "OP_ATANH": "{0}.atanh()",
     "OP_LOG1P": "{0}.log1p()", "OP_EXPM1": "{0}.expm1()", "OP_ERF": "{0}.erf()", "OP_ERFINV": "{0}.erfinv()",
     "OP_FABS": "{0}.abs()", "OP_SIGN": "{0}.sign()", "OP_FLOOR": "{0}.floor()", "OP_CEIL": "{0}.ceil()",
-}
-TENSOR_OPS = {  # of two tensors: a constant operand becomes a scalar tensor
-    "OP_FMOD": "torch.fmod({0}, {1})", "OP_REMAINDER": "remainder({0}, {1})", "OP_COPYSIGN": "copysign({0}, {1})",
-    "OP_FMIN": "fmin({0}, {1})", "OP_FMAX": "fmax({0}, {1})",
-    "OP_ATAN2": "torch.atan2({0}, {1})", "OP_HYPOT": "torch.hypot({0}, {1})",
+    "OP_FMOD": "fmod({0}, {1})", "OP_REMAINDER": "remainder({0}, {1})", "OP_COPYSIGN": "copysign({0}, {1})",
+    "OP_FMIN": "fmin({0}, {1})", "OP_FMAX": "fmax({0}, {1})", "OP_ATAN2": "atan2({0}, {1})",
+    "OP_HYPOT": "hypot({0}, {1})",
 }
 COMPARISONS = {"OP_LT": "{0} < {1}", "OP_LE": "{0} <= {1}", "OP_EQ": "{0} == {1}", "OP_NE": "{0} != {1}"}
 LOGIC = {"OP_NOT": "~{0}", "OP_AND": "{0} & {1}", "OP_OR": "{0} | {1}"}  # of boolean tensors
 BOOLEAN = COMPARISONS.keys() | LOGIC.keys()
 COPIES = {"OP_ASSIGN", "OP_LIFT"}
-UNARY = {name for name, code in (FLOAT_OPS | LOGIC).items() if "{1}" not in code}
-SAFE = {  # an argument at which the operation has finite derivatives, for branches that are switched off
+SAFE = {  # operands at which the operation has finite derivatives, for branches that are switched off
     **dict.fromkeys(["OP_LOG", "OP_SQRT", "OP_INV", "OP_POW", "OP_CONSTPOW", "OP_DIV", "OP_FMOD", "OP_REMAINDER",
                      "OP_ATAN2", "OP_HYPOT", "OP_EXP", "OP_EXPM1", "OP_SINH", "OP_COSH"], 1.0),
     **dict.fromkeys(["OP_TAN", "OP_ASIN", "OP_ACOS", "OP_ATANH", "OP_LOG1P", "OP_ERFINV"], 0.0), "OP_ACOSH": 2.0,
 }
 
 
-def _fmin(a: Tensor, b: Tensor) -> Tensor:
+Operand = Tensor | float
+
+
+def _pair(a: Operand, b: Operand) -> tuple[Tensor, Tensor]:
+    """Both as tensors; at least one is."""
+    if isinstance(a, Tensor):
+        return a, b if isinstance(b, Tensor) else a.new_full((), b)
+    assert isinstance(b, Tensor)  # the graph folds operations on constants
+    return b.new_full((), a), b
+
+
+def _power(a: Operand, b: Operand) -> Tensor:
+    """a^b; at b = 0, where torch drops the derivative 1 / a of d/da a^b = b a^(b - 1) by b, as a^(b - 1) a."""
+    if not (isinstance(a, Tensor) and isinstance(b, Tensor)):
+        return a**b  # type: ignore[return-value]  # at least one is a tensor
+    zero = (b == 0) & (a != 0)
+    return torch.where(zero, torch.where(zero, a, 1.0) ** (torch.where(zero, b, 0.0) - 1.0) * a, a**b)
+
+
+def _fmin(a: Operand, b: Operand) -> Tensor:
     """min(a, b), half of the derivative to each at ties; NaN only where both are."""
+    a, b = _pair(a, b)
     return 0.5 * (torch.fmin(a, b) + torch.fmin(b, a))
 
 
-def _fmax(a: Tensor, b: Tensor) -> Tensor:
+def _fmax(a: Operand, b: Operand) -> Tensor:
     """max(a, b), half of the derivative to each at ties; NaN only where both are."""
+    a, b = _pair(a, b)
     return 0.5 * (torch.fmax(a, b) + torch.fmax(b, a))
 
 
-def _copysign(a: Tensor, b: Tensor) -> Tensor:
+def _atan2(a: Operand, b: Operand) -> Tensor:
+    """The angle of the point (b, a)."""
+    return torch.atan2(*_pair(a, b))
+
+
+def _hypot(a: Operand, b: Operand) -> Tensor:
+    """sqrt(a^2 + b^2) without overflow."""
+    return torch.hypot(*_pair(a, b))
+
+
+def _copysign(a: Operand, b: Operand) -> Tensor:
     """|a| with the sign of b (-0.0 counts as negative)."""
-    return torch.copysign(a, b.detach())
+    a, b = _pair(a, b)
+    return a.abs() * torch.copysign(torch.ones_like(b), b.detach())
 
 
-def _remainder(a: Tensor, b: Tensor) -> Tensor:
-    """IEEE 754 remainder a - n b, n = a / b rounded half to even: exact, unlike torch.remainder's floored one."""
-    r = torch.fmod(a, 2.0 * b)
-    ratio, size = r.abs(), b.abs()
-    half_turns = (ratio > 0.5 * size).to(r.dtype) + (ratio >= 1.5 * size).to(r.dtype)
-    return r - half_turns * (r.sign() * b.sign()) * b
+def _fmod(a: Operand, b: Operand) -> Tensor:
+    """a - n b, n = a / b rounded towards zero: exact."""
+    if isinstance(a, Tensor) and not isinstance(b, Tensor):
+        return torch.fmod(a, b)
+    a, b = _pair(a, b)
+    return _multiple_off(torch.fmod(a.detach(), b.detach()), a, b)
 
 
-HELPERS: dict[str, Any] = {"torch": torch, "inf": math.inf, "nan": math.nan, "fmin": _fmin, "fmax": _fmax,
-                           "copysign": _copysign, "remainder": _remainder}
+def _remainder(a: Operand, b: Operand) -> Tensor:
+    """a - n b, n = a / b rounded half to even: exact (IEEE 754), unlike torch.remainder's floored one."""
+    a, b = _pair(a, b)
+    with_sign, size = torch.fmod(a.detach(), 2.0 * b.detach()), b.detach().abs()
+    turns = (with_sign.abs() > 0.5 * size).to(size.dtype) + (with_sign.abs() >= 1.5 * size).to(size.dtype)
+    return _multiple_off(with_sign - turns * with_sign.sign() * size, a, b)
+
+
+def _multiple_off(r: Tensor, a: Tensor, b: Tensor) -> Tensor:
+    """The value r = a - n b with the derivatives 1 and -n; torch's n = trunc(a / b) is off where a / b rounds up."""
+    n = ((a.detach() - r) / b.detach()).round()
+    return r + (a - a.detach()) - n * (b - b.detach())
+
+
+HELPERS: dict[str, Any] = {
+    "torch": torch, "inf": math.inf, "nan": math.nan, "power": _power, "fmin": _fmin, "fmax": _fmax, "fmod": _fmod,
+    "remainder": _remainder, "copysign": _copysign, "atan2": _atan2, "hypot": _hypot}
 
 
 class Node(NamedTuple):
@@ -78,7 +123,7 @@ class Node(NamedTuple):
 
 
 class Graph:
-    """The expression graph of a function, each distinct scalar once; `outputs[i]` are the nodes of output i, by columns.
+    """The expression graph of a function, each distinct scalar once; `outputs[i]` are output i's nodes, by columns.
 
     Raises ValueError where the function has an operation without a twin in torch.
     """
@@ -97,10 +142,9 @@ class Graph:
                 work[step.out[0]] = self._operation(step.op, tuple(work[i] for i in step.args), function.name())
 
     def _operation(self, op: str, args: tuple[int, ...], owner: str) -> int:
-        known = op in FLOAT_OPS or op in TENSOR_OPS or op in BOOLEAN or op in COPIES or op == "OP_IF_ELSE_ZERO"
-        if not known:
-            raise ValueError(f"{owner}: got the operation {op}, which has no twin in torch; expected elementary "
-                             f"operations of SX: rewrite {owner} without it")
+        if not (op in FLOAT_OPS or op in BOOLEAN or op in COPIES or op == "OP_IF_ELSE_ZERO"):
+            raise ValueError(f"{owner} contains {op}, which has no twin in torch; expected elementary operations of "
+                             f"SX: rewrite {owner} without it (table look-ups and never_inline calls are OP_CALL)")
         if op in COPIES:
             return args[0]
         args = args[:1] if op in UNARY else args
@@ -200,19 +244,18 @@ class _Writer:
     def number(self, i: int) -> str:
         """Node i as a float tensor, or as a literal where it is constant."""
         if (i, "float") not in self.names:
-            self.names[i, "float"] = self.new(f"{self.names[i, 'bool']}.to(dtype)")
+            self.names[i, "float"] = self.new(f"{self.names[i, 'bool']}.to(x0.dtype)")
         return self.names[i, "float"]
 
-    def tensor(self, i: int) -> str:
-        """Node i as a float tensor; constants as a scalar one."""
-        return f"full({self.number(i)})" if self.graph.nodes[i].op == "OP_CONST" else self.number(i)
+    def constant(self, i: int) -> bool:
+        """Whether node i is a number, known now."""
+        return self.graph.nodes[i].op == "OP_CONST"
 
     def truth(self, i: int) -> str:
         """Node i as a boolean tensor, or as True or False."""
         if (i, "bool") not in self.names:
-            node = self.graph.nodes[i]
-            constant = node.op == "OP_CONST"
-            self.names[i, "bool"] = str(node.value != 0) if constant else self.new(f"{self.number(i)} != 0.0")
+            value = self.graph.nodes[i].value
+            self.names[i, "bool"] = str(value != 0) if self.constant(i) else self.new(f"{self.number(i)} != 0.0")
         return self.names[i, "bool"]
 
     def write(self, i: int) -> None:
@@ -228,25 +271,29 @@ class _Writer:
         elif op in ("OP_IF_ELSE_ZERO", "OP_WHERE"):
             self.names[i, "float"] = self.new(self._where(*args))
         else:
-            self.names[i, "float"] = self.new((FLOAT_OPS | TENSOR_OPS)[op].format(*self._operands(i)))
+            self.names[i, "float"] = self.new(FLOAT_OPS[op].format(*self._operands(i)))
 
     def _where(self, condition: int, yes: int, no: int | None = None) -> str:
         a, b = self.number(yes), "0.0" if no is None else self.number(no)
-        if self.graph.nodes[condition].op == "OP_CONST":
+        if self.constant(condition):
             return a if self.graph.nodes[condition].value else b
-        if a[0] == "(" and b[0] in "(0":
-            a = f"full({a})"
+        if self.constant(yes) and (no is None or self.constant(no)):
+            a = f"x0.new_full((), {a})"  # of two floats, torch.where would choose the dtype
         return f"torch.where({self.truth(condition)}, {a}, {b})"
 
     def _operands(self, i: int) -> list[str]:
         """The operands of node i; where its branch is off, a number at which its derivatives are finite."""
         op, args, _ = self.graph.nodes[i]
-        names = [self.tensor(j) if op in TENSOR_OPS else self.number(j) for j in args]
+        names = [self.number(j) for j in args]
+        return [name if self.constant(j) else self._guarded(name, i, SAFE.get(op, 0.0))
+                for name, j in zip(names, args, strict=True)]
+
+    def _guarded(self, name: str, i: int, safe: float) -> str:
         for condition, wanted in self._guards(i):
-            choice = "torch.where({0}, {1}, {2})" if wanted else "torch.where({0}, {2}, {1})"
-            names = [name if self.graph.nodes[j].op == "OP_CONST" or self.graph.nodes[condition].op == "OP_CONST" else
-                     self.new(choice.format(self.truth(condition), name, SAFE[op])) for name, j in zip(names, args)]
-        return names
+            if not self.constant(condition):
+                branches = f"{name}, {safe}" if wanted else f"{safe}, {name}"
+                name = self.new(f"torch.where({self.truth(condition)}, {branches})")
+        return name
 
     def source(self) -> str:
         """The function body(x0, x1, ...) -> list of lists of columns (tensors or floats)."""
@@ -256,9 +303,19 @@ class _Writer:
             flat = f"x{k}" if columns == 1 else f"x{k}.flatten(-2)"
             head += [f"{', '.join(order)}, = {flat}.unbind(-1)"] if order else []
         outputs = ", ".join(f"[{', '.join(map(self.number, output))}]" for output in self.graph.outputs)
-        head += ["dtype = x0.dtype", "full = lambda c: x0.new_full((), c)"]
         arguments = ", ".join(f"x{k}" for k in range(len(self.shapes)))
-        return "\n    ".join([f"def body({arguments}):", *head, *self.lines, f"return [{outputs}]"])
+        return "\n    ".join([f"def body({arguments}):", *_free_early([*head, *self.lines, f"return [{outputs}]"])])
+
+
+def _free_early(lines: list[str]) -> list[str]:
+    """The lines, with `del` behind the last use of each intermediate v0, v1, ...: their memory is used again."""
+    seen, result = set(re.findall(r"\bv\d+\b", lines[-1])), [lines[-1]]
+    for line in reversed(lines[:-1]):
+        used = re.findall(r"\bv\d+\b", line)
+        done = sorted(set(used) - seen)
+        result += [line if not done else f"{line}; del {', '.join(done)}"]
+        seen.update(used)
+    return result[::-1]
 
 
 class TorchFunction:
@@ -272,6 +329,7 @@ class TorchFunction:
         dense = expand(function)
         self._in = [dense.size_in(i) for i in range(dense.n_in())]
         self._out = [dense.size_out(i) for i in range(dense.n_out())]
+        self._names = tuple(function.name_in())
         self._widths = tuple(_row_shape(*size) for size in self._in)
         self.source = _Writer(Graph(dense), self._in).source()
         self._body = self._compile()
@@ -299,11 +357,15 @@ class TorchFunction:
 
     def _check(self, args: tuple[Tensor, ...]) -> tuple[tuple[Tensor, ...], torch.Size]:
         """The arguments with one common batch shape, and that shape."""
-        names = self.function.name_in()
+        names = self._names
         if len(args) != len(names):
             raise ValueError(f"{self.name} got {len(args)} arguments, expected {len(names)}: "
                              f"pass {', '.join(names)}, each a tensor of rows [B, n]")
         batches = [self._batch(x, k) for k, x in enumerate(args)]
+        for x, name in zip(args[1:], names[1:], strict=True):
+            if x.dtype != args[0].dtype or x.device != args[0].device:
+                raise ValueError(f"{self.name}: {name} is {x.dtype} on {x.device}, expected {args[0].dtype} on "
+                                 f"{args[0].device} as {names[0]}: use {name}.to({names[0]})")
         if all(batch == batches[0] for batch in batches[1:]):
             return args, batches[0]
         try:
@@ -315,7 +377,7 @@ class TorchFunction:
         return tuple(x.expand(*batch, *w) for x, w in zip(args, self._widths, strict=True)), batch
 
     def _batch(self, x: Tensor, k: int) -> torch.Size:
-        name, width = self.function.name_in(k), self._widths[k]
+        name, width = self._names[k], self._widths[k]
         if not isinstance(x, Tensor) or not x.is_floating_point():
             kind = x.dtype if isinstance(x, Tensor) else type(x).__name__
             raise ValueError(f"{self.name}: {name} is {kind}, expected a tensor of floats: use torch.as_tensor(...)")
