@@ -1,0 +1,148 @@
+"""LQR about the goal pair of an OCP: baseline, warm start, test oracle.
+
+With d = x - x* it is V = d' P d / 2 + const and u = u* - K d. With the Hessians Q, R, S of L and the Jacobians A, B of
+f at (x*, u*), K = R^-1 (B' P + S') and -dP/dt = Q + A' P + P A - K' R K, P(T) = the Hessian of G (Anderson, Moore
+(1990), "Optimal Control: Linear Quadratic Methods", ch. 2-3); on an infinite horizon dP/dt = 0.
+"""
+
+from __future__ import annotations
+
+from functools import cached_property
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.integrate import solve_ivp
+from scipy.interpolate import BSpline, make_interp_spline
+from scipy.linalg import LinAlgError, solve_continuous_are
+
+from nocl import checks
+from nocl.checks import Array
+from nocl.ocp import OCP
+
+DEGREE = 5  # of the spline through P(t)
+REFINE = 3  # spline nodes for each step of the Riccati integration
+STATIONARY = 1e-8  # largest |f| and |gradient| at the goal pair, beyond which it is no equilibrium
+
+
+class LQR:
+    """u(x, t) = clip(u* - K(t) (x - x*), U) on a finite horizon, or with constant K where `infinite`.
+
+    Raises ValueError where the goal pair is no equilibrium of f, no stationary point of L and G, where the Hessian of
+    L in u is not positive definite, and (infinite) where (A, B) is not stabilisable.
+    """
+
+    def __init__(self, ocp: OCP, infinite: bool = False) -> None:
+        self.ocp, self.infinite = ocp, infinite
+        self.A, self.B = ocp.system.linearize(ocp.x_goal, ocp.u_goal)
+        self.Q, self.R, self.S, self.P_final = _hessians(ocp)
+        _check_equilibrium(ocp)
+        if np.linalg.eigvalsh(self.R).min() <= 0:
+            raise ValueError(f"LQR of {ocp.system.name!r}: the Hessian of L in u has the eigenvalues "
+                             f"{np.linalg.eigvalsh(self.R).tolist()}; expected > 0: add a cost on each control")
+        self._L_goal, self._G_goal = float(ocp.L(ocp.x_goal, ocp.u_goal)), float(ocp.G(ocp.x_goal))
+        if infinite:
+            self._P_infinite = self._solve_infinite()
+
+    @cached_property
+    def _spline(self) -> BSpline:
+        """P(t) on [0, T] as one spline, for numpy and CasADi alike."""
+        n, T = len(self.A), self.ocp.horizon
+
+        def backward(s: float, p: Array) -> Array:
+            P = p.reshape(n, n)
+            K = self._gain(P)
+            return (self.Q + self.A.T @ P + P @ self.A - K.T @ self.R @ K).ravel()
+
+        path = solve_ivp(backward, (0.0, T), self.P_final.ravel(), method="LSODA", rtol=1e-11, atol=1e-12,
+                         dense_output=True)
+        if not path.success:
+            raise ValueError(f"LQR of {self.ocp.system.name!r}: the Riccati equation has no solution on [0, {T:g}] "
+                             f"({path.message}): L may not be convex at the goal; shorten the horizon")
+        fine = np.linspace(0, 1, REFINE, endpoint=False)
+        s = np.r_[(path.t[:-1, None] + np.diff(path.t)[:, None] * fine).ravel(), T]
+        return make_interp_spline(T - s[::-1], path.sol(s).T[::-1], k=DEGREE)
+
+    def _solve_infinite(self) -> Array:
+        try:
+            P = solve_continuous_are(self.A, self.B, self.Q, self.R, s=self.S)
+            stable = np.isfinite(P).all() and np.linalg.eigvals(self.A - self.B @ self._gain(P)).real.max() < 0
+        except LinAlgError:
+            stable = False
+        if not stable:
+            raise ValueError(f"LQR of {self.ocp.system.name!r}: no stabilising gain on an infinite horizon; expected "
+                             "(A, B) stabilisable at the goal and every slow mode in L: use the finite horizon, or "
+                             "a cost on the states in L")
+        return P
+
+    def _gain(self, P: Array) -> Array:
+        return np.asarray(np.linalg.solve(self.R, self.B.T @ P + self.S.T), dtype=np.float64)
+
+    def P(self, t: float = 0.0) -> Array:
+        """The Hessian of V at time t, [nx, nx]."""
+        if self.infinite:
+            return self._P_infinite
+        n = len(self.A)
+        P = self._spline(min(max(float(t), 0.0), self.ocp.horizon)).reshape(n, n)
+        return (P + P.T) / 2
+
+    def K(self, t: float = 0.0) -> Array:
+        """The gain at time t, [nu, nx]."""
+        return self._gain(self.P(t))
+
+    def __call__(self, x: ArrayLike, t: float = 0.0) -> Array:
+        """u [nu] or [B, nu], clipped to U."""
+        s = self.ocp.system
+        rows, single = checks.states(x, s.nx, s.name, "x")
+        u = np.clip(self.ocp.u_goal - (rows - self.ocp.x_goal) @ self.K(t).T, s.lbu, s.ubu)
+        return u[0] if single else u
+
+    def value(self, x: ArrayLike, t: float = 0.0) -> Array | float:
+        """V [B], or a number for one state: cost to go of the linear-quadratic problem without bounds.
+
+        On an infinite horizon, what it costs beyond staying at the goal.
+        """
+        rows, single = checks.states(x, self.ocp.system.nx, self.ocp.system.name, "x")
+        d = rows - self.ocp.x_goal
+        rest = 0.0 if self.infinite else self._L_goal * (self.ocp.horizon - t) + self._G_goal
+        V = np.einsum("bi,ij,bj->b", d, self.P(t), d) / 2 + rest
+        return float(V[0]) if single else V
+
+    def to_casadi(self) -> ca.Function:
+        """policy:(x, t) -> u, the same controller in MX."""
+        s, n = self.ocp.system, len(self.A)
+        x, t = ca.MX.sym("x", s.nx), ca.MX.sym("t")
+        P: Any = ca.DM(self.P(0.0))
+        if not self.infinite:
+            spline = self._spline
+            inside = ca.fmin(ca.fmax(t, 0.0), self.ocp.horizon)
+            entries = ca.bspline(inside, spline.c.ravel().tolist(), [spline.t.tolist()], [DEGREE], n * n, {})
+            P = ca.reshape(entries, n, n)
+        K = ca.mtimes(ca.DM(np.linalg.inv(self.R)), ca.mtimes(self.B.T, P) + self.S.T)
+        u = self.ocp.u_goal - ca.mtimes(K, x - self.ocp.x_goal)
+        return ca.Function("policy", [x, t], [ca.fmin(ca.fmax(u, s.lbu), s.ubu)], ["x", "t"], ["u"])
+
+
+def _hessians(ocp: OCP) -> tuple[Array, Array, Array, Array]:
+    """(Q, R, S [nx, nu], Hessian of G) at the goal pair."""
+    s = ocp.system
+    H, _ = ca.hessian(ocp.running, ca.vertcat(s.x, s.u))
+    H_G, _ = ca.hessian(ocp.terminal, s.x)
+    at = ca.Function("hessians", [s.x, s.u], [ca.densify(H), ca.densify(H_G)])
+    H, P = (m.full() for m in at(ocp.x_goal, ocp.u_goal))
+    return H[: s.nx, : s.nx], H[s.nx:, s.nx:], H[: s.nx, s.nx:], P
+
+
+def _check_equilibrium(ocp: OCP) -> None:
+    s = ocp.system
+    gradients = ca.Function("gradients", [s.x, s.u], [ca.densify(ca.gradient(ocp.running, ca.vertcat(s.x, s.u))),
+                                                      ca.densify(ca.gradient(ocp.terminal, s.x))])
+    L_z, G_x = (g.full().ravel() for g in gradients(ocp.x_goal, ocp.u_goal))
+    f = s.f(ocp.x_goal, ocp.u_goal).full().ravel()
+    for what, values, names in (("f", f, s.state_names), ("the gradient of L", L_z, s.names),
+                                ("the gradient of G", G_x, s.state_names)):
+        i = int(np.argmax(np.abs(values)))
+        if abs(values[i]) > STATIONARY:
+            raise ValueError(f"LQR of {s.name!r}: at the goal pair {what} is {values[i]:.4g} in {names[i]}; "
+                             "expected 0: LQR needs an equilibrium that is stationary for the cost; move the goal pair")
