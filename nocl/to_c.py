@@ -170,8 +170,8 @@ def _generate(function: ca.Function, name: str, real: str) -> tuple[str, dict[st
         code, header = (Path(folder, f"{name}{end}").read_text() for end in (".c", ".h"))
     foreign = re.search(r"#error.*|\b(malloc|calloc|free|printf|fopen|dlopen)\b", code)
     if foreign:
-        raise ValueError(f"to_c: the C code of {function.name()} has {foreign[0]!r} in it; expected plain arithmetic: leave out "
-                         "solvers, integrators and callbacks")
+        raise ValueError(f"to_c: the C code of {function.name()} has {foreign[0]!r} in it; expected plain "
+                         "arithmetic: leave out solvers, integrators and callbacks")
     return code, {key: int(n) for key, n in re.findall(rf"#define {name}_SZ_(\w+) (\d+)", header)}
 
 
