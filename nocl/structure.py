@@ -10,28 +10,39 @@ point of [lb, ub] nearest to 0, h_j the longest step from there inside the box, 
 and the labels of the entries E (nx (1 + |S|) functions of r, in the units of xdot) are differences of labels of f.
 An entry's variables are those that change it; one whose slope is the same everywhere is split off as an exact linear
 term; what is a polynomial in the other variables and the sines and cosines of angles is found by least squares and
-kept if it holds at fresh points; the rest is grouped by its variables, and left to one network a group.
+kept if it holds at fresh points. An entry that is such a polynomial in *some* of its variables is expanded,
+
+    E(r) = known(r) + sum_t C_t(the others) M_t(those),
+
+with labels of the coefficients C_t by interpolation between labels of f, and the coefficients are treated as entries
+were. What is left is grouped by its variables, one network a group: cart-pole is left with six functions of theta.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations, combinations_with_replacement
+from functools import partial, reduce
+from itertools import combinations, combinations_with_replacement, product
+from operator import mul
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from nocl import pretty
 from nocl.checks import Array
 from nocl.data import Dataset
 
 Oracle = Callable[[Array, Array], Dataset]  # x [N, nx], u [N, nu] -> labels with Jacobians
+Labels = Callable[[Array], tuple[Array, Array]]  # z [N, nz] -> values [N, E] and gradients [N, E, nz]
 Draw = Callable[[int], tuple[Array, Array]]  # n -> fresh rows z [n, nz] and their entries [n, E]
 
 TOLERANCE = 1e-9  # of the largest |f_i|: above rounding, far below anything that matters
 MAX_TERMS = 400  # of a polynomial in features
 MAX_DEGREE = 4
+MAX_EXPANDED = 81  # monomials of an expansion
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,19 +121,76 @@ class Split:
 
 
 @dataclass(frozen=True)
+class Expansion:
+    """Entries that are polynomials in some variables: E = known + sum_t C_t(the others) M_t(these), t = 0, ..., T-1.
+
+    Coefficient c = e T + t is C_t of the e-th entry. Without variables, T = 1 and the coefficients are the entries.
+    """
+
+    box: Box
+    entries: tuple[int, ...]
+    variables: tuple[int, ...] = ()  # indices into z
+    degrees: tuple[int, ...] = ()  # of each variable; angles: 1, in sin and cos
+
+    @property
+    def terms(self) -> int:
+        """T"""
+        return math.prod(len(_nodes(self.box, k, d)) for k, d in zip(self.variables, self.degrees, strict=True))
+
+    def monomials(self, z: ca.SX) -> list[ca.SX]:
+        """M_t, T products of powers of z_k / max |z_k|, or of sin and cos of angles."""
+        parts = [_powers(self.box, k, d, z) for k, d in zip(self.variables, self.degrees, strict=True)]
+        return [_product(factors) for factors in product(*parts)]
+
+    def labels(self, entries: Labels, z: Array) -> tuple[Array, Array]:
+        """Coefficients [N, n T] and their gradients [N, n T, nz] at rows z, from T labels of the entries a row."""
+        nodes = np.array(list(product(*(_nodes(self.box, k, d) for k, d in zip(self.variables, self.degrees, strict=True)))))
+        T, own, p = len(nodes), list(self.entries), list(self.variables)
+        rows = np.repeat(z[None], T, axis=0)  # [T, N, nz]
+        rows[:, :, p] = nodes[:, None, :]
+        value, gradient = entries(rows.reshape(-1, self.box.nz))
+        value = value[:, own].reshape(T, len(z), len(own))
+        gradient = gradient[:, own].reshape(T, len(z), len(own), -1)
+        symbol = ca.SX.sym("z", self.box.nz)
+        basis = evaluate(_with_jacobian(symbol, self.monomials(symbol)), rows[:, 0])[0]  # [T nodes, T terms]
+        interpolate = np.linalg.inv(basis)  # [T terms, T nodes]
+        value = np.einsum("ts,sne->net", interpolate, value)
+        gradient = np.einsum("ts,snek->netk", interpolate, gradient)
+        gradient[..., p] = 0.0
+        return value.reshape(len(z), -1), gradient.reshape(len(z), len(own) * T, -1)
+
+
+def _nodes(box: Box, k: int, degree: int) -> Array:
+    """Values of variable k that determine a polynomial of this degree; of an angle, a sine and a cosine."""
+    centre, half = (box.lb[k] + box.ub[k]) / 2, box.width[k] / 2
+    if k in box.angles:
+        return centre + np.array([-1.0, 0.0, 1.0]) * min(2 * half, 2 * np.pi) / 3
+    return centre + half * np.cos(np.pi * np.arange(degree + 1) / max(degree, 1))[::-1]
+
+
+def _powers(box: Box, k: int, degree: int, z: ca.SX) -> list[ca.SX]:
+    if k in box.angles:
+        return [ca.SX(1), ca.sin(z[k]), ca.cos(z[k])]
+    unit = z[k] / max(abs(box.lb[k]), abs(box.ub[k]))
+    return [unit**d for d in range(degree + 1)]
+
+
+@dataclass(frozen=True)
 class Group:
-    """Entries that are functions of the same variables, to be learned by one network."""
+    """Coefficients that are functions of the same variables, to be learned by one network."""
 
     variables: tuple[int, ...]  # indices into z
-    entries: tuple[int, ...]
+    coefficients: tuple[int, ...]  # numbered through all expansions
 
 
 @dataclass(frozen=True, eq=False)
 class Structure:
-    """What the labels say about f: E(z) = known(z) + what the groups' networks must learn."""
+    """What the labels say about f: E(z) = known(z) + sum over coefficients of M(z) times what a network must learn."""
 
     split: Split
-    known: ca.Function  # z [nz] -> (entries [E], their Jacobian [E, nz]), SX
+    linear: ca.Function  # z -> (entries' linear and polynomial parts [E], Jacobian), SX: what expansions start from
+    expansions: tuple[Expansion, ...]
+    exact: ca.Function  # z -> (the coefficients' exact parts [C], Jacobian), SX
     groups: tuple[Group, ...]
     words: str
     labels: int  # of f, that were used
@@ -131,13 +199,43 @@ class Structure:
     def found(self) -> bool:
         """False where f is left as it is, to one network of all variables."""
         box = self.split.box
-        return bool(self.split.affine) or self.groups != (Group(tuple(range(box.nz)), tuple(range(box.nx))),)
+        return bool(self.split.affine) or self.expansions != (Expansion(box, tuple(range(box.nx))),) \
+            or self.groups != (Group(tuple(range(box.nz)), tuple(range(box.nx))),)
+
+    @property
+    def cost(self) -> int:
+        """Labels of f that one row of coefficient labels takes."""
+        return self.split.columns * sum(expansion.terms for expansion in self.expansions)
 
     def residual(self, oracle: Oracle, z: Array) -> tuple[Array, Array]:
-        """Entries [N, E] and gradients [N, E, nz] at rows z, less the known part: the networks' labels."""
-        value, gradient = self.split.labels(oracle, z)
-        known, slope = evaluate(self.known, z)
-        return value - known, gradient - slope
+        """The networks' labels: coefficients [N, C] and gradients [N, C, nz] at rows z, less their exact parts."""
+        entries = _less(partial(self.split.labels, oracle), self.linear)
+        parts = [expansion.labels(entries, z) for expansion in self.expansions]
+        exact, slope = evaluate(self.exact, z)
+        value, gradient = (np.concatenate(p, axis=1) for p in zip(*parts, strict=True))
+        return value - exact, gradient - slope
+
+    def xdot(self, learned: Mapping[int, ca.SX], z: ca.SX) -> ca.SX:
+        """xdot [nx] from the networks' answers, by coefficient."""
+        entries = ca.vertsplit(self.linear(z)[0])
+        values = ca.vertsplit(self.exact(z)[0]) if self.expansions else []
+        c = 0
+        for expansion in self.expansions:
+            monomials = expansion.monomials(z)
+            for e in expansion.entries:
+                for monomial in monomials:
+                    entries[e] = entries[e] + (values[c] + learned.get(c, ca.SX(0))) * monomial
+                    c += 1
+        return self.split.combine(entries, z)
+
+
+def _less(labels: Labels, known: ca.Function) -> Labels:
+    """Labels less a known part."""
+    def residual(z: Array) -> tuple[Array, Array]:
+        (value, gradient), (known_value, slope) = labels(z), evaluate(known, z)
+        return value - known_value, gradient - slope
+
+    return residual
 
 
 def label(oracle: Oracle, z: Array, nx: int) -> tuple[Array, Array]:
@@ -162,33 +260,46 @@ def evaluate(function: ca.Function, z: Array) -> tuple[Array, Array]:
 
 
 def _with_jacobian(z: ca.SX, expressions: Sequence[ca.SX]) -> ca.Function:
-    column = ca.densify(ca.vertcat(*expressions))
+    column = ca.densify(ca.vertcat(*expressions)) if expressions else ca.SX(0, 1)
     return ca.Function("known", [z], [column, ca.densify(ca.jacobian(column, z))], ["z"], ["value", "jacobian"])
 
 
 def plain(box: Box, words: str = "no structure used: one network of all variables") -> Structure:
     """One network z -> f, nothing known."""
-    split = Split(box, (), np.zeros(0), np.zeros(0))
+    z, zero = ca.SX.sym("z", box.nz), [ca.SX(0)] * box.nx
     group = Group(tuple(range(box.nz)), tuple(range(box.nx)))
-    return Structure(split, _with_jacobian(ca.SX.sym("z", box.nz), [ca.SX(0)] * box.nx), (group,), words, 0)
+    return Structure(Split(box, (), np.zeros(0), np.zeros(0)), _with_jacobian(z, zero),
+                     (Expansion(box, tuple(range(box.nx))),), _with_jacobian(z, zero), (group,), words, 0)
 
 
 def find(oracle: Oracle, box: Box, *, seed: int = 0, probes: int = 64, features: bool = True) -> Structure:
-    """The structure of the black box f on its box, from about (2 + nz) (1 + |S|) `probes` labels.
+    """The structure of the black box f on its box, from some thousand labels.
 
     With `features`, polynomials in the variables and in sin, cos of angles count as known once they hold at fresh
-    points. Labels without Jacobians and labels that are not finite raise ValueError.
+    points, and entries are expanded where they are such polynomials in some of their variables. Labels without
+    Jacobians and labels that are not finite raise ValueError.
     """
     rng, counter = np.random.default_rng(seed), _Counter(oracle)
     split = affine_split(counter, box, rng, probes)
-    slopes = _slopes(counter, split, rng, probes)
-
-    def draw(n: int) -> tuple[Array, Array]:
-        z = box.sample(n, rng)
-        return z, split.labels(counter, z)[0]
-
-    structure = _build(split, slopes, draw, features)
-    return replace(structure, labels=counter.n)
+    first = _Stage(box, partial(split.labels, counter), split.scale, split.rest, rng, probes)
+    known, left = first.exact(features)
+    linear = _with_jacobian(first.z, known)
+    entries = _less(first.labels, linear)
+    if features:
+        expansions = _expansions(box, entries, split.scale(first.labels(box.sample(probes, rng))[0]), left, rng, probes)
+    else:
+        expansions = (Expansion(box, tuple(left)),) if left else ()
+    exact: list[ca.SX] = []
+    learned: dict[int, tuple[int, ...]] = {}
+    for expansion in expansions:
+        size = first.size()[list(expansion.entries)].repeat(expansion.terms)
+        rest = tuple(k for k in split.rest if k not in expansion.variables)
+        stage = _Stage(box, partial(expansion.labels, entries), lambda _, size=size: size, rest, rng, probes, first.z)
+        found, variables = stage.exact(features)
+        learned |= {len(exact) + c: v for c, v in variables.items()}
+        exact += found
+    structure = Structure(split, linear, tuple(expansions), _with_jacobian(first.z, exact), _grouped(learned), "", counter.n)
+    return replace(structure, words=describe(structure))
 
 
 def read(z: Array, value: Array, gradient: Array, box: Box, *, features: bool = True) -> Structure:
@@ -208,22 +319,90 @@ def read(z: Array, value: Array, gradient: Array, box: Box, *, features: bool = 
         order = np.roll(order, -n)  # the next rows, so that a fit and its test share none while 2 n <= N
         return z[order[:n]], value[order[:n]]
 
-    return _build(split, slopes, draw, features and len(z) >= 40)
+    symbol = ca.SX.sym("z", box.nz)
+    known, left = _known(box, slopes, draw, split.scale, symbol, features and len(z) >= 40)
+    expansions = (Expansion(box, tuple(left)),) if left else ()
+    learned = {c: left[e] for c, e in enumerate(left)}
+    structure = Structure(split, _with_jacobian(symbol, known), expansions,
+                          _with_jacobian(symbol, [ca.SX(0)] * len(left)), _grouped(learned), "", len(z))
+    return replace(structure, words=describe(structure))
 
 
-def _build(split: Split, slopes: Array, draw: Draw, features: bool) -> Structure:
-    """Known parts and groups from the constant slopes [E, nz] and, for what else is exact, from fresh samples."""
-    z = ca.SX.sym("z", split.box.nz)
+class _Stage:
+    """Finds what is exact in a family of functions of z that can be labelled anywhere in the box."""
+
+    def __init__(self, box: Box, labels: Labels, scale: Callable[[Array], Array], rest: tuple[int, ...],
+                 rng: np.random.Generator, probes: int, z: ca.SX | None = None) -> None:
+        self.box, self.labels, self.scale, self.rest, self.rng, self.probes = box, labels, scale, rest, rng, probes
+        self.z = ca.SX.sym("z", box.nz) if z is None else z
+
+    def size(self) -> Array:
+        """What rounding goes with, a number for each function."""
+        return self.scale(self.labels(self.box.sample(self.probes, self.rng))[0])
+
+    def draw(self, n: int) -> tuple[Array, Array]:
+        z = self.box.sample(n, self.rng)
+        return z, self.labels(z)[0]
+
+    def exact(self, features: bool) -> tuple[list[ca.SX], dict[int, tuple[int, ...]]]:
+        """(each function's exact part, the variables of those that have more to them)."""
+        slopes = _slopes(self.labels, self.scale, self.box, self.rest, self.rng, self.probes)
+        return _known(self.box, slopes, self.draw, self.scale, self.z, features)
+
+
+def _known(box: Box, slopes: Array, draw: Draw, scale: Callable[[Array], Array], z: ca.SX,
+           features: bool) -> tuple[list[ca.SX], dict[int, tuple[int, ...]]]:
+    """(exact parts, variables of what is not exact) from constant slopes [E, nz] and, for polynomials, fresh samples."""
     known = [_linear(row, z) for row in slopes]
-    learned = []
-    for group in _grouped((e, np.flatnonzero(np.isnan(row))) for e, row in enumerate(slopes)):
-        found = _polynomials(draw, split, group, known, z) if features or not group.variables else {}
-        for e, expression in found.items():
-            known[e] = known[e] + expression
-        left = tuple(e for e in group.entries if e not in found)
-        learned += [Group(group.variables, left)] if left else []
-    structure = Structure(split, _with_jacobian(z, known), tuple(learned), "", 0)
-    return replace(structure, words=describe(structure, known, z))
+    variables = {e: tuple(int(k) for k in np.flatnonzero(np.isnan(row))) for e, row in enumerate(slopes)}
+    for group in _grouped(variables):
+        if features or not group.variables:
+            for e, expression in _polynomials(box, draw, scale, group, known, z).items():
+                known[e] = known[e] + expression
+                del variables[e]
+    return known, variables
+
+
+def _grouped(variables: Mapping[int, tuple[int, ...]]) -> tuple[Group, ...]:
+    """What is a function of the same variables, in the order of the first member."""
+    groups: dict[tuple[int, ...], list[int]] = {}
+    for c, v in variables.items():
+        groups.setdefault(v, []).append(c)
+    return tuple(Group(v, tuple(members)) for v, members in groups.items())
+
+
+def _expansions(box: Box, entries: Labels, scale: Array, variables: Mapping[int, tuple[int, ...]],
+                rng: np.random.Generator, probes: int) -> tuple[Expansion, ...]:
+    """The entries by the variables in which they are polynomials of a low degree."""
+    degree = {k: _degrees(box, entries, scale, k, rng, probes) for k in sorted({k for v in variables.values() for k in v})}
+    kinds: dict[tuple[tuple[int, int], ...], list[int]] = {}
+    for e, own in variables.items():
+        chosen = [(k, int(degree[k][e])) for k in own if degree[k][e] > 0]
+        while Expansion(box, (e,), *_columns(chosen)).terms > MAX_EXPANDED:
+            chosen.remove(max(chosen, key=lambda c: c[1]))
+        kinds.setdefault(tuple(chosen), []).append(e)
+    return tuple(Expansion(box, tuple(members), *_columns(chosen)) for chosen, members in kinds.items())
+
+
+def _columns(pairs: Sequence[tuple[int, int]]) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    return tuple(k for k, _ in pairs), tuple(d for _, d in pairs)
+
+
+def _degrees(box: Box, entries: Labels, scale: Array, k: int, rng: np.random.Generator, probes: int) -> NDArray[np.int_]:
+    """The lowest degree up to 3 of each entry in variable k (angles: 1, in sin and cos); 0 where there is none. [E]"""
+    z = box.sample(probes, rng)
+    values = box.lb[k] + box.width[k] * (np.arange(9) + rng.uniform(0.2, 0.8, 9)) / 9
+    rows = np.repeat(z[None], len(values), axis=0)
+    rows[:, :, k] = values[:, None]
+    labels = entries(rows.reshape(-1, box.nz))[0].reshape(len(values), -1)  # [9, N E]
+    symbol = ca.SX.sym("z", box.nz)
+    degrees = np.zeros(len(scale), dtype=int)
+    for degree in (1,) if k in box.angles else (3, 2, 1):
+        basis = evaluate(_with_jacobian(symbol, _powers(box, k, degree, symbol)), rows[:, 0])[0]
+        error = basis @ np.linalg.lstsq(basis, labels, rcond=None)[0] - labels
+        fits = np.abs(error).reshape(-1, len(scale)).max(axis=0) <= TOLERANCE * scale
+        degrees[fits] = degree
+    return degrees
 
 
 class _Counter:
@@ -276,19 +455,19 @@ def _moved(z: Array, box: Box, k: int, rng: np.random.Generator) -> Array:
     return moved
 
 
-def _slopes(oracle: Oracle, split: Split, rng: np.random.Generator, probes: int) -> Array:
-    """Each entry's constant slope in each variable: 0 where it does not enter, NaN where the slope varies. [E, nz]
+def _slopes(labels: Labels, scale: Callable[[Array], Array], box: Box, rest: Sequence[int], rng: np.random.Generator,
+            probes: int) -> Array:
+    """Each function's constant slope in each variable: 0 where it does not enter, NaN where the slope varies. [E, nz]
 
     Both the values under one-at-a-time moves and the gradients must agree, so that steps and dead zones are seen.
     """
-    box = split.box
     z = box.sample(probes, rng)
-    value, gradient = split.labels(oracle, z)
-    slopes = np.zeros((split.n_entries, box.nz))
-    for k in split.rest:
+    value, gradient = labels(z)
+    slopes = np.zeros(gradient.shape[1:])
+    for k in rest:
         moved = _moved(z, box, k, rng)
-        value_k, gradient_k = split.labels(oracle, moved)
-        tolerance = TOLERANCE * split.scale(np.concatenate([value, value_k]))
+        value_k, gradient_k = labels(moved)
+        tolerance = TOLERANCE * scale(np.concatenate([value, value_k]))
         every = np.concatenate([gradient[:, :, k], gradient_k[:, :, k]])  # [2 N, E]
         slope = np.median(every, axis=0)
         slope[np.abs(slope) * box.width[k] <= tolerance] = 0.0
@@ -302,20 +481,13 @@ def _linear(slopes: Array, z: ca.SX) -> ca.SX:
     return sum((float(s) * z[k] for k, s in enumerate(slopes) if np.isfinite(s) and s != 0), ca.SX(0))
 
 
-def _grouped(entries: Iterable[tuple[int, Array]]) -> list[Group]:
-    """Entries by the variables in which they are not linear, in the order of their first entry."""
-    groups: dict[tuple[int, ...], list[int]] = {}
-    for e, variables in entries:
-        groups.setdefault(tuple(int(k) for k in variables), []).append(e)
-    return [Group(variables, tuple(members)) for variables, members in groups.items()]
-
-
-def _polynomials(draw: Draw, split: Split, group: Group, known: Sequence[ca.SX], z: ca.SX) -> dict[int, ca.SX]:
-    """The group's entries that are polynomials in features, of the lowest degree that holds at fresh points."""
+def _polynomials(box: Box, draw: Draw, scale: Callable[[Array], Array], group: Group, known: Sequence[ca.SX],
+                 z: ca.SX) -> dict[int, ca.SX]:
+    """Those of a group that are polynomials in features, of the lowest degree that holds at fresh points."""
     found: dict[int, ca.SX] = {}
     for degree in range(MAX_DEGREE + 1 if group.variables else 1):
-        terms = _monomials(split.box, group.variables, z, degree)
-        left = [e for e in group.entries if e not in found]
+        terms = _monomials(box, group.variables, z, degree)
+        left = [e for e in group.coefficients if e not in found]
         if len(terms) > MAX_TERMS or not left:
             break
         (fit, fit_value), (test, test_value) = draw(2 * len(terms) + 20), draw(2 * len(terms) + 20)
@@ -325,7 +497,7 @@ def _polynomials(draw: Draw, split: Split, group: Group, known: Sequence[ca.SX],
         fit_target = fit_value[:, left] - evaluate(linear, fit)[0]
         test_target = test_value[:, left] - evaluate(linear, test)[0]
         fit_basis, test_basis = evaluate(basis, fit)[0], evaluate(basis, test)[0]
-        tolerance = TOLERANCE * split.scale(np.concatenate([fit_value, test_value]))[left]
+        tolerance = TOLERANCE * scale(np.concatenate([fit_value, test_value]))[left]
         for i, e in enumerate(left):
             c = _sparse_fit(fit_basis, fit_target[:, i], float(tolerance[i]))
             if np.abs(test_basis @ c - test_target[:, i]).max() <= tolerance[i]:
@@ -346,7 +518,7 @@ def _sparse_fit(basis: Array, target: Array, tolerance: float) -> Array:
 
 def _monomials(box: Box, variables: Sequence[int], z: ca.SX, degree: int) -> list[ca.SX]:
     """Products of at most `degree` features: the variables, and sin and cos of angles (sin^2 = 1 - cos^2 left out)."""
-    features = []  # (expression, index of the angle whose sine it is)
+    features: list[tuple[ca.SX, int | None]] = []  # (expression, index of the angle whose sine it is)
     for k in variables:
         features += [(ca.sin(z[k]), k), (ca.cos(z[k]), None)] if k in box.angles else [(z[k], None)]
     terms = []
@@ -361,41 +533,54 @@ def _monomials(box: Box, variables: Sequence[int], z: ca.SX, degree: int) -> lis
 
 
 def _product(factors: Sequence[ca.SX]) -> ca.SX:
-    product = ca.SX(1)
-    for factor in factors:
-        product = product * factor
-    return product
+    return reduce(mul, factors) if factors else ca.SX(1)
 
 
-def describe(structure: Structure, known: Sequence[ca.SX], z: ca.SX) -> str:
-    """The structure in words: which controls are affine, which equations are exact, what is learned of which variables."""
-    split, box = structure.split, structure.split.box
+def describe(structure: Structure) -> str:
+    """The structure in words: what enters affinely, which equations are exact, what is learned of which variables."""
     if not structure.found:
         return "no structure found: one network of all variables"
-    named = [ca.SX.sym(name) for name in box.names]
-    learned = {e for group in structure.groups for e in group.entries}
-    expressions = ca.substitute(list(known), [z], [ca.vertcat(*named)])
-    words = [f"affine in {', '.join(box.names[k] for k in split.affine)}"] if split.affine else []
-    exact = [i for i in range(box.nx) if not learned & set(range(i * split.columns, (i + 1) * split.columns))]
-    for i in exact:
-        row = split.combine([expressions[e] if e // split.columns == i else ca.SX(0) for e in range(split.n_entries)],
-                            ca.vertcat(*named))[i]
-        words.append(f"d {box.names[i]}/dt = {_short(row)} exact")
-    for group in structure.groups:
-        what = ", ".join(_entry(split, e) for e in group.entries)
-        words.append(f"{what} learned as functions of ({', '.join(box.names[k] for k in group.variables)})")
+    split, box = structure.split, structure.split.box
+    words = [f"affine in {_and(box.names[k] for k in split.affine)}"] if split.affine else []
+    learned = {c for group in structure.groups for c in group.coefficients}
+    rows: set[int] = set()
+    polynomial, c = [], 0
+    for expansion in structure.expansions:
+        n = expansion.terms
+        open_entries = [e for j, e in enumerate(expansion.entries) if learned & set(range(c + j * n, c + (j + 1) * n))]
+        rows |= {e // split.columns for e in open_entries}
+        if open_entries and expansion.variables:
+            polynomial.append(_polynomial_words(expansion, split, open_entries))
+        c += n * len(expansion.entries)
+    words += [f"{_derivative(box, i)} = {_formula(structure, i)} exact" for i in range(box.nx) if i not in rows]
+    words += polynomial
+    words += [f"{_count(len(g.coefficients))} of {_and(_derivative(box, i) for i in sorted(rows))} learned as functions of "
+              f"{_and(box.names[k] for k in g.variables)}" for g in structure.groups]
     return "; ".join(words)
 
 
-def _short(expression: ca.SX, length: int = 60) -> str:
-    text = str(expression)
-    return text if len(text) <= length and "@" not in text else "a closed form"
+def _polynomial_words(expansion: Expansion, split: Split, entries: Sequence[int]) -> str:
+    box, how = split.box, {1: "linear", 2: "quadratic", 3: "cubic"}
+    kinds = [f"linear in sin and cos of {box.names[k]}" if k in box.angles else f"{how[d]} in {box.names[k]}"
+             for k, d in zip(expansion.variables, expansion.degrees, strict=True)]
+    return f"{_and(_derivative(box, i) for i in sorted({e // split.columns for e in entries}))} {_and(kinds)}"
 
 
-def _entry(split: Split, e: int) -> str:
-    i, j = divmod(e, split.columns)
-    row = f"d {split.box.names[i]}/dt"
-    if not split.affine:
-        return row
-    at = ", ".join(f"{split.box.names[k]} = {w:g}" for k, w in zip(split.affine, split.w0, strict=True))
-    return f"{row} at {at}" if j == 0 else f"the slope of {row} in {split.box.names[split.affine[j - 1]]}"
+def _derivative(box: Box, i: int) -> str:
+    return f"d {box.names[i]}/dt"
+
+
+def _and(names: Iterable[str]) -> str:
+    *most, last = names
+    return f"{', '.join(most)} and {last}" if most else last
+
+
+def _count(n: int) -> str:
+    return "1 coefficient" if n == 1 else f"{n} coefficients"
+
+
+def _formula(structure: Structure, i: int, length: int = 60) -> str:
+    """Row i of xdot where nothing is learned, as text if it is short."""
+    z = ca.vertcat(*(ca.SX.sym(name) for name in structure.split.box.names))
+    rows, shared = pretty.lines(ca.simplify(structure.xdot({}, z)[i]), z)
+    return rows[0] if not shared and len(rows[0]) <= length else "a closed form"

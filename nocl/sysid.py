@@ -16,7 +16,6 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import torch
-from numpy.typing import ArrayLike
 from torch import Tensor
 from tqdm import tqdm
 
@@ -26,13 +25,14 @@ from nocl.checks import Array
 from nocl.data import Dataset
 from nocl.nets import ACTIVATIONS, MLP, FeatureNet
 from nocl.sampling import Seed
-from nocl.structure import Box, Group, Oracle, Split, Structure
+from nocl.structure import Box, Expansion, Group, Oracle, Split, Structure
 from nocl.system import System
 from nocl.to_casadi import to_casadi
 
 METHODS = ("default", "mlp", "paper")
 KIND = "dynamics"
-CHUNK = 10_000  # labels held at a time with all their entries
+CHUNK = 100_000  # labels of f held at a time
+MIN_ROWS = 2048  # of labels, however many labels of f one takes
 MAX_POLISHED = 2600  # parameters: beyond, a Levenberg-Marquardt step costs more than it gives
 FULL_JACOBIAN = 4  # variables up to which every derivative is supervised, beyond it random directions
 
@@ -139,7 +139,7 @@ class LearnedDynamics:
         """Write folder/dynamics.safetensors: weights, maps, the system's equations and the card, as data."""
         parts = None if self.parts is None else _structure_data(self.parts)
         card = {"system": self.system.to_data(), "structure": self.structure, "card": dict(self.card), "parts": parts}
-        known = {} if self.parts is None else {"known": self.parts.known}
+        known = {} if self.parts is None else {"linear": self.parts.linear, "exact": self.parts.exact}
         return store.save(folder, KIND, nets={"f": self.net}, functions=known, card=card)
 
     @staticmethod
@@ -307,12 +307,13 @@ def _pool(source: _Source, parts: Structure, settings: Settings, rng: np.random.
     """Labels for every group: fresh uniform samples of the box, or all of the data."""
     if source.data is not None:
         z, value, gradient = source.data
+        own = [e for expansion in parts.expansions for e in expansion.entries]  # without variables: entries of f
         jacobian = np.zeros((len(z), source.box.nx, source.box.nz)) if gradient is None else gradient
-        known, slope = structures.evaluate(parts.known, z)
-        return _collect([(z, value - known, jacobian - slope)], parts, gradient is not None)
+        known, slope = structures.evaluate(parts.linear, z)
+        return _collect([(z, (value - known)[:, own], (jacobian - slope)[:, own])], parts, gradient is not None)
     assert source.oracle is not None
-    z = source.box.sample(-(-settings.samples // parts.split.columns), rng)
-    chunks = ((rows, *parts.residual(source.oracle, rows)) for rows in np.array_split(z, -(-len(z) // CHUNK)))
+    z = source.box.sample(max(settings.samples // parts.cost, MIN_ROWS), rng)
+    chunks = ((rows, *parts.residual(source.oracle, rows)) for rows in np.array_split(z, -(-len(z) * parts.cost // CHUNK)))
     return _collect(chunks, parts, source.gradients)
 
 
@@ -320,8 +321,8 @@ def _collect(chunks: Any, parts: Structure, gradients: bool) -> _Pool:
     rows, values, slopes = [], [], []
     for z, value, gradient in chunks:
         rows.append(z)
-        values.append([value[:, g.entries] for g in parts.groups])
-        slopes.append([gradient[:, g.entries][:, :, g.variables] for g in parts.groups] if gradients else [])
+        values.append([value[:, g.coefficients] for g in parts.groups])
+        slopes.append([gradient[:, g.coefficients][:, :, g.variables] for g in parts.groups] if gradients else [])
     join = [[np.concatenate(part) for part in zip(*pieces, strict=True)] for pieces in (values, slopes)]
     return _Pool(np.concatenate(rows), join[0], join[1] if gradients else None)
 
@@ -451,18 +452,15 @@ def _mlp(weights: fit.Weights) -> MLP:
 
 def _assemble(parts: Structure, weights: Sequence[fit.Weights], angles: bool) -> FeatureNet:
     """f_theta: features, the groups' networks, and the known part with the affine controls as the output map."""
-    split, box = parts.split, parts.split.box
+    box = parts.split.box
     x, u = ca.SX.sym("x", box.nx), ca.SX.sym("u", box.nz - box.nx)
     z = ca.vertcat(x, u)
     phi = [ca.vertcat(*_features(box, g, z, angles)[0]) for g in parts.groups]
-    y = [ca.SX.sym(f"y{i}", len(g.entries)) for i, g in enumerate(parts.groups)]
-    entries = ca.vertsplit(parts.known(z)[0])
-    for group, answer in zip(parts.groups, y, strict=True):
-        for j, e in enumerate(group.entries):
-            entries[e] = entries[e] + answer[j]
+    y = [ca.SX.sym(f"y{i}", len(g.coefficients)) for i, g in enumerate(parts.groups)]
+    learned = {c: a[j] for g, a in zip(parts.groups, y, strict=True) for j, c in enumerate(g.coefficients)}
     inputs = ca.Function("features", [x, u], phi, ["x", "u"], [f"phi{i}" for i in range(len(phi))])
     names = ["x", "u", *(f"y{i}" for i in range(len(y)))]
-    outputs = ca.Function("xdot", [x, u, *y], [split.combine(entries, z)], names, ["xdot"])
+    outputs = ca.Function("xdot", [x, u, *y], [parts.xdot(learned, z)], names, ["xdot"])
     return FeatureNet(inputs, [_mlp(w) for w in weights], outputs).eval()
 
 
@@ -590,7 +588,8 @@ class _Checkpoint:
 def _structure_data(parts: Structure) -> dict[str, Any]:
     split = parts.split
     return {"affine": list(split.affine), "w0": split.w0.tolist(), "h": split.h.tolist(), "words": parts.words,
-            "labels": parts.labels, "groups": [[list(g.variables), list(g.entries)] for g in parts.groups],
+            "labels": parts.labels, "groups": [[list(g.variables), list(g.coefficients)] for g in parts.groups],
+            "expansions": [[list(e.entries), list(e.variables), list(e.degrees)] for e in parts.expansions],
             "lb": split.box.lb.tolist(), "ub": split.box.ub.tolist()}
 
 
@@ -599,5 +598,6 @@ def _structure_from(data: Mapping[str, Any] | None, functions: Mapping[str, ca.F
         return None
     box = replace(box, lb=np.array(data["lb"]), ub=np.array(data["ub"]))
     split = Split(box, tuple(data["affine"]), np.array(data["w0"]), np.array(data["h"]))
-    groups = tuple(Group(tuple(v), tuple(e)) for v, e in data["groups"])
-    return Structure(split, functions["known"], groups, data["words"], data["labels"])
+    expansions = tuple(Expansion(box, *map(tuple, parts)) for parts in data["expansions"])
+    groups = tuple(Group(tuple(v), tuple(c)) for v, c in data["groups"])
+    return Structure(split, functions["linear"], expansions, functions["exact"], groups, data["words"], data["labels"])
