@@ -18,7 +18,7 @@ FAR = 1.5  # widths of X round the goal: a rollout that leaves them is too wild 
 HALVINGS = 12  # of a random control, until its rollout stays there
 
 
-def starts(program: Transcription, lqr: LQR | None, x0: Array, h: float, n: int, seed: int) -> list[Guess]:
+def starts(program: Transcription, lqr: LQR | None, x0: Array, t: Array, n: int, seed: int) -> list[Guess]:
     """The first n of: x0 held under u*, an LQR rollout, a straight line to the goal, smooth random controls.
 
     The random controls depend on `seed` alone, so that a state gets the same starts in any batch.
@@ -27,9 +27,9 @@ def starts(program: Transcription, lqr: LQR | None, x0: Array, h: float, n: int,
     u_goal = np.tile(ocp.u_goal, (N, 1))
     found = [(np.tile(x0, (N + 1, 1)), u_goal)]
     if n > 1 and lqr is not None:
-        found += lqr_rollout(program, lqr, x0, h)
-    found.append((x0 + np.linspace(0, 1, N + 1)[:, None] * (ocp.x_goal - x0), u_goal))
-    found += [controlled(program, x0, u, h) for u in random_controls(ocp, N, n - len(found), seed)]
+        found += lqr_rollout(program, lqr, x0, t)
+    found.append((x0 + np.linspace(0.0, 1.0, N + 1)[:, None] * (ocp.x_goal - x0), u_goal))
+    found += [controlled(program, x0, u, t) for u in random_controls(ocp, N, n - len(found), seed)]
     return found[:n]
 
 
@@ -43,28 +43,28 @@ def lqr_of(ocp: OCP) -> LQR | None:
     return lqr
 
 
-def controlled(program: Transcription, x0: Array, u: Array, h: float) -> Guess:
+def controlled(program: Transcription, x0: Array, u: Array, t: Array) -> Guess:
     """The rollout of controls u [N, nu] from x0, moved towards u* until it stays near the box X.
 
     A rollout that never does (an unstable system) gives way to x0 held.
     """
     u_goal = program.ocp.u_goal
     for _ in range(HALVINGS):
-        x = np.vstack([x0, program.rollout(x0, u.T, h).full().T])
+        x = np.vstack([x0, program.rollout(x0, u.T, np.diff(t)[None]).full().T])
         if _reasonable(program.ocp, x):
             return x, u
         u = (u + u_goal) / 2
     return np.tile(x0, (len(u) + 1, 1)), u
 
 
-def lqr_rollout(program: Transcription, lqr: LQR, x0: Array, h: float) -> list[Guess]:
-    """LQR, clipped to U, from x0 over the last N intervals of the horizon; nothing where it runs away."""
+def lqr_rollout(program: Transcription, lqr: LQR, x0: Array, t: Array) -> list[Guess]:
+    """LQR, clipped to U, from x0 on the nodes t [N+1]; nothing where it runs away."""
     N = program.N
     x, u = np.empty((N + 1, len(x0))), np.empty((N, program.ocp.system.nu))
     x[0] = x0
     for k in range(N):
-        u[k] = lqr(x[k], program.ocp.horizon - (N - k) * h)
-        x[k + 1] = program.step(x[k], u[k], h)[0].full().ravel()
+        u[k] = lqr(x[k], t[k])
+        x[k + 1] = program.step(x[k], u[k], t[k + 1] - t[k])[0].full().ravel()
         if not _reasonable(program.ocp, x[k + 1]):
             return []
     return [(x, u)]

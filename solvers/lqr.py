@@ -119,6 +119,7 @@ class LQR:
             inside = ca.fmin(ca.fmax(t, 0.0), self.ocp.horizon)
             entries = ca.bspline(inside, spline.c.ravel().tolist(), [spline.t.tolist()], [DEGREE], n * n, {})
             P = ca.reshape(entries, n, n)
+            P = (P + P.T) / 2
         K = ca.mtimes(ca.DM(np.linalg.inv(self.R)), ca.mtimes(self.B.T, P) + self.S.T)
         u = self.ocp.u_goal - ca.mtimes(K, x - self.ocp.x_goal)
         return ca.Function("policy", [x, t], [ca.fmin(ca.fmax(u, s.lbu), s.ubu)], ["x", "t"], ["u"])

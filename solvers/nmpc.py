@@ -27,6 +27,7 @@ from nocl.solvers.transcription import BACKENDS, FEASIBLE, Answer, Transcription
 SAME = 1e-3  # costs closer than this, relative, count as the same optimum
 BETTER = 1e-6  # relative improvement that makes a neighbour's solution worth passing on
 TINY = 1e-10  # ... and absolute: costs below it are equal
+LAST = 0.95  # largest share of what is left of the horizon that a closed loop's first interval may take
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,13 +80,14 @@ class NMPC:
         return _program(self.ocp, self.dynamics, int(self.intervals), int(self.substeps), self.constraints == "soft",
                         self.solver, options)
 
-    def solve(self, x0: ArrayLike, guesses: Any = None, *, t0: float = 0.0, starts: int | None = None,
-              progress: bool | None = None) -> Solution:
+    def solve(self, x0: ArrayLike, guesses: Any = None, *, t0: float = 0.0, nodes: ArrayLike | None = None,
+              starts: int | None = None, progress: bool | None = None) -> Solution:
         """The best solution found from each state x0 [nx] or [B, nx] at time t0.
 
         Parameters
         ----------
         guesses : tried first: a Solution or Trajectory, controls u [B, N, nu], (x [B, N+1, nx], u), or a list of them
+        nodes : times of the nodes [N+1] up to the horizon; default: from t0, all intervals equal
         starts : built-in starts for each state; default: self.starts, or none where guesses are given
         progress : a bar on stderr; default: where that is a terminal
 
@@ -95,22 +97,30 @@ class NMPC:
         """
         s = self.ocp.system
         rows, _ = checks.states(x0, s.nx, s.name)
-        if not 0 <= t0 < self.ocp.horizon:
-            raise ValueError(f"t0 is {t0!r}; expected 0 <= t0 < {self.ocp.horizon:g}, the horizon")
+        t = self._nodes(t0, nodes)
         given = _given(guesses, len(rows), self.intervals, s.nx, s.nu)
         n = starts if starts is not None else (0 if given else self.starts)
         if n < 1 and not given:
             raise ValueError(f"starts is {n}; expected at least 1, or guesses")
-        h = (self.ocp.horizon - t0) / self.intervals
-        searches = [_Search(self.program, row, h) for row in rows]
+        searches = [_Search(self.program, row, t) for row in rows]
         show = sys.stderr.isatty() if progress is None else progress
         for i, search in enumerate(_bar(searches, show, "NMPC")):
-            search.run(given_guess(self.program, search.x0, x[i] if x is not None else None, u[i], h) for x, u in given)
+            search.run(given_guess(self.program, search.x0, x[i] if x is not None else None, u[i], t) for x, u in given)
             if n:
-                search.run(starting.starts(self.program, _lqr(self.ocp), search.x0, h, n, self.seed))
+                search.run(starting.starts(self.program, _lqr(self.ocp), search.x0, t, n, self.seed))
         if n:
             self._exchange(searches, show)
-        return _collect(searches, np.linspace(t0, self.ocp.horizon, self.intervals + 1))
+        return _collect(searches, t)
+
+    def _nodes(self, t0: float, nodes: ArrayLike | None) -> Array:
+        T, N = self.ocp.horizon, self.intervals
+        if not 0 <= t0 < T:
+            raise ValueError(f"t0 is {t0!r}; expected 0 <= t0 < {T:g}, the horizon")
+        t = np.linspace(t0, T, N + 1) if nodes is None else np.asarray(nodes, dtype=np.float64)
+        if t.shape != (N + 1,) or not (np.diff(t) > 0).all() or t[0] < 0 or abs(t[-1] - T) > 1e-9 * T:
+            raise ValueError(f"nodes have shape {t.shape}; expected N + 1 = {N + 1} rising times in [0, {T:g}], "
+                             "the last at the horizon")
+        return t
 
     def _exchange(self, searches: list[_Search], show: bool) -> None:
         """Solve each state again from its nearest neighbours' solutions, until nothing improves or `passes` rounds."""
@@ -133,9 +143,9 @@ class NMPC:
             if not improved:
                 return
 
-    def controller(self, **settings: Any) -> Any:
-        """Closed loop: see nocl.solvers.nmpc.Loop."""
-        return Loop(self, **settings)
+    def controller(self, hold: int | None = None) -> Loop:
+        """Closed loop u(x, t), solved again at each call; hold: how many controls the horizon has (default N)."""
+        return Loop(self, hold)
 
 
 @lru_cache(maxsize=32)
@@ -152,8 +162,8 @@ def _lqr(ocp: OCP) -> LQR | None:
 class _Search:
     """All that was tried from one state."""
 
-    def __init__(self, program: Transcription, x0: Array, h: float) -> None:
-        self.program, self.x0, self.h = program, x0, h
+    def __init__(self, program: Transcription, x0: Array, t: Array) -> None:
+        self.program, self.x0, self.t = program, x0, t
         self.best: Answer | None = None
         self.failed: Answer | None = None
         self.costs: list[float] = []
@@ -167,7 +177,7 @@ class _Search:
     def run(self, guesses: Iterable[Guess]) -> None:
         for x, u in guesses if not self.refusal else ():
             begin = time.perf_counter()
-            answer = self.program.solve(self.x0, self.h, x, u)
+            answer = self.program.solve(self.x0, self.t, x, u)
             self.seconds += time.perf_counter() - begin
             self.iterations += answer.iterations
             self.costs.append(answer.cost)
@@ -253,11 +263,11 @@ def _shaped(value: ArrayLike, shape: tuple[int, ...], what: str, form: str) -> A
     return array
 
 
-def given_guess(program: Transcription, x0: Array, x: Array | None, u: Array, h: float) -> Guess:
+def given_guess(program: Transcription, x0: Array, x: Array | None, u: Array, t: Array) -> Guess:
     """A user's guess; without states, the rollout of its controls."""
     if x is not None:
         return x, u
-    rolled = np.vstack([x0, program.rollout(x0, u.T, h).full().T])
+    rolled = np.vstack([x0, program.rollout(x0, u.T, np.diff(t)[None]).full().T])
     return (rolled if np.isfinite(rolled).all() else np.tile(x0, (len(u) + 1, 1))), u
 
 
@@ -266,58 +276,55 @@ def _bar(items: Sequence[Any], show: bool, what: str) -> Iterable[Any]:
 
 
 class Loop:
-    """NMPC as feedback u(x, t): solved again at each call from the last solution, shifted to the new time.
+    """NMPC as feedback u(x, t) on a shrinking horizon: at each call solved again from the last solution, shifted.
 
-    Shrinking horizon: always to the OCP's own end, so that cost is comparable. `stats` has one entry a call: time,
-    success, seconds. Where a solve fails the last solution's control for that time is used, and flagged there.
+    The first interval of each plan is as long as the control will be held, `hold` times within the horizon; the rest of
+    the horizon is cut into N - 1 equal ones. A call at an earlier time than the last, or with another number of states,
+    starts afresh from all starts. `stats` has an entry a call: t, success, seconds, message. A state whose solve fails
+    keeps its last plan, or u* where it has none yet: flagged by success False and the message there.
     """
 
-    def __init__(self, nmpc: NMPC) -> None:
-        self.nmpc = nmpc
-        self.last: Solution | None = None
+    def __init__(self, nmpc: NMPC, hold: int | None = None) -> None:
+        self.nmpc, self.hold = nmpc, hold or nmpc.intervals
+        self.plan: Solution | None = None
         self.stats: list[dict[str, Any]] = []
-
-    def reset(self) -> None:
-        """Forget the last solution: the next call searches from all starts."""
-        self.last, self.stats = None, []
 
     def __call__(self, x: ArrayLike, t: float = 0.0) -> Array:
         """u [nu] or [B, nu] at time t."""
         s = self.nmpc.ocp.system
         rows, single = checks.states(x, s.nx, s.name, "x")
-        t = min(float(t), self.nmpc.ocp.horizon * (1 - 1e-6))  # the last control is asked for at the end, too
-        last = self.last if self.last is not None and len(self.last.x) == len(rows) and self.last.t[0] <= t else None
-        if last is None:
-            solution = self.nmpc.solve(rows, t0=t, progress=False)
+        nodes = self.nodes(float(t))
+        last = self.plan
+        if last is None or len(last.x) != len(rows) or last.t[0] > nodes[0]:
+            self.stats, guess = [], (np.repeat(rows[:, None], len(nodes), axis=1),
+                                     np.tile(self.nmpc.ocp.u_goal, (len(rows), len(nodes) - 1, 1)))
+            solution = self.nmpc.solve(rows, nodes=nodes, progress=False)
         else:
-            solution = self.nmpc.solve(rows, [_shift(last, rows, t)], t0=t, progress=False)
-            solution = _patched(solution, last, t)
-        if not np.isfinite(solution.u).all():
-            failed = int(np.flatnonzero(~np.isfinite(solution.u).all(axis=(1, 2)))[0])
-            raise RuntimeError(f"NMPC at t = {t:g}, state {failed}: {solution.message[failed]}")
-        self.stats.append({"t": t, "success": solution.success, "seconds": solution.seconds,
+            guess = _shift(last, rows, nodes)
+            solution = self.nmpc.solve(rows, guess, nodes=nodes, progress=False)
+        self.stats.append({"t": float(t), "success": solution.success, "seconds": solution.seconds,
                            "message": solution.message})
-        self.last = solution
-        return solution.u[0, 0] if single else solution.u[:, 0]
+        self.plan = _patched(solution, guess)
+        return self.plan.u[0, 0] if single else self.plan.u[:, 0]
+
+    def nodes(self, t: float) -> Array:
+        """t, t + the time that a control is held, ..., the horizon [N+1]."""
+        T, N = self.nmpc.ocp.horizon, self.nmpc.intervals
+        t = min(t, T * (1 - 1e-6))  # some ask at the end, too
+        first = min(T / self.hold, LAST * (T - t))
+        return np.r_[t, np.linspace(t + first, T, N)]
 
 
-def _shift(last: Solution, x: Array, t: float) -> tuple[Array, Array]:
-    """The last solution on the nodes from t on, its states moved to the measured x at the start."""
+def _shift(last: Solution, x: Array, nodes: Array) -> tuple[Array, Array]:
+    """The last plan on new nodes, its states moved to the measured x at the start."""
     N = last.u.shape[1]
-    nodes = np.linspace(t, last.t[-1], N + 1)
     held = np.clip(np.searchsorted(last.t, (nodes[:-1] + nodes[1:]) / 2, side="right") - 1, 0, N - 1)
     states = np.stack([np.stack([np.interp(nodes, last.t, column) for column in path.T], axis=1) for path in last.x])
-    states += np.linspace(1, 0, N + 1)[None, :, None] * (x - states[:, 0])[:, None]
-    return states, last.u[:, held]
+    return states + np.linspace(1, 0, N + 1)[None, :, None] * (x - states[:, 0])[:, None], last.u[:, held]
 
 
-def _patched(solution: Solution, last: Solution, t: float) -> Solution:
-    """Rows whose solve failed keep the last solution, shifted; their success stays False."""
-    bad = np.logical_not(solution.success)
-    if not bad.any():
-        return solution
-    x, u = _shift(last, last.x[:, 0], t)
-    x, u = np.where(bad[:, None, None], x, solution.x), np.where(bad[:, None, None], u, solution.u)
-    message = [m if ok else f"{m}; the last solution's control is used"
-               for m, ok in zip(solution.message, solution.success, strict=True)]
-    return replace(solution, trajectory=Trajectory(solution.t, x, u), message=message)
+def _patched(solution: Solution, guess: tuple[Array, Array]) -> Solution:
+    """Rows whose solve failed hold the guess instead; their success stays False."""
+    ok = np.asarray(solution.success)[:, None, None]
+    x, u = np.where(ok, solution.x, guess[0]), np.where(ok, solution.u, guess[1])
+    return replace(solution, trajectory=Trajectory(solution.t, x, u))

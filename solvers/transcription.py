@@ -1,8 +1,8 @@
 """Multiple shooting: an OCP as a nonlinear program with the structure that fatrop needs, and back.
 
-Variables w = [x_0, u_0, x_1, u_1, ..., x_N], parameters p = [x_0, h] (h the length of an interval); constraints, stage
-by stage, x_{k+1} - F(x_k, u_k; h) = 0, then x_0 - p = 0 at k = 0 and h(x_k) >= 0 at k >= 1. A node's multiplier of the
-gap is minus its costate: lambda_{k+1} = dJ*/dx_{k+1}.
+Variables w = [x_0, u_0, x_1, u_1, ..., x_N], parameters p = [x_0, h_0, ..., h_{N-1}], the lengths of the intervals.
+Constraints, stage by stage: x_{k+1} - F(x_k, u_k; h_k) = 0, then x_0 - p = 0 at k = 0 and h(x_k) >= 0 at k >= 1. A
+gap's multiplier is minus the costate of the node that it leads to: lambda_{k+1} = dJ*/dx_{k+1}.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Transcription:
 
     @cached_property
     def rollout(self) -> ca.Function:
-        """(x0, u [nu, N], h) -> x_1 ... x_N [nx, N]."""
+        """(x0, u [nu, N], h [1, N]) -> x_1 ... x_N [nx, N]."""
         s = self.ocp.system
         sym: Any = ca.SX.sym if self.f.is_a("SXFunction") else ca.MX.sym
         x, u, h = sym("x", s.nx), sym("u", s.nu), sym("h")
@@ -78,10 +78,10 @@ class Transcription:
     def program(self) -> dict[str, ca.MX]:
         """x, p, f, g of the nonlinear program, in MX."""
         s, N = self.ocp.system, self.N
-        X, U, p = ca.MX.sym("x", s.nx, N + 1), ca.MX.sym("u", s.nu, N), ca.MX.sym("p", s.nx + 1)
-        ends, costs = self.step.map(N)(X[:, :-1], U, ca.repmat(p[-1], 1, N))
+        X, U, p = ca.MX.sym("x", s.nx, N + 1), ca.MX.sym("u", s.nu, N), ca.MX.sym("p", s.nx + N)
+        ends, costs = self.step.map(N)(X[:, :-1], U, p[s.nx:].T)
         gaps = ca.horzsplit(X[:, 1:] - ends)
-        paths = [X[:, 0] - p[:-1], *([self.ocp.h(X[:, k]) for k in range(1, N + 1)] if self.n_path else [])]
+        paths = [X[:, 0] - p[: s.nx], *([self.ocp.h(X[:, k]) for k in range(1, N + 1)] if self.n_path else [])]
         w = ca.vertcat(*(v for k in range(N) for v in (X[:, k], U[:, k])), X[:, N])
         g = ca.vertcat(*(v for k in range(N) for v in (gaps[k], *paths[k: k + 1])), *paths[N:])
         flat = ca.Function("flat", [X, U, p], [w, ca.sum2(costs) + self.ocp.G(X[:, N]), g])
@@ -125,15 +125,15 @@ class Transcription:
         first = np.r_[s.nx, 0, 2 * s.nx + (s.nx + m) * np.arange(N - 1)]
         return first[:, None] + np.arange(s.nx)
 
-    def solve(self, x0: Array, h: float, x: Array, u: Array) -> Answer:
-        """Solve from x0 with the guess x [N+1, nx], u [N, nu]."""
+    def solve(self, x0: Array, t: Array, x: Array, u: Array) -> Answer:
+        """Solve from x0 on the nodes t [N+1] with the guess x [N+1, nx], u [N, nu]."""
         w0 = np.r_[np.c_[x[:-1], u].ravel(), x[-1]]
-        result = self.solver(x0=w0, p=np.r_[x0, h], **self.bounds)
+        result = self.solver(x0=w0, p=np.r_[x0, np.diff(t)], **self.bounds)
         stats = self.solver.stats()
         X, U = (v.full().T for v in self.split(result["x"]))
         U = np.clip(U, self.ocp.system.lbu, self.ocp.system.ubu)  # IPOPT relaxes bounds by 1e-8
         costate = -result["lam_g"].full().ravel()[self.gap_rows]
-        worst, where = self.violation(result["g"].full().ravel(), h)
+        worst, where = self.violation(result["g"].full().ravel(), t)
         status = words(stats)
         success = bool(stats["success"]) and worst <= FEASIBLE and np.isfinite(X).all()
         if not success:
@@ -141,7 +141,7 @@ class Transcription:
         cost = float(result["f"]) if success else np.inf
         return Answer(X, U, costate, cost, success, status, worst, int(stats.get("iter_count", 0)))
 
-    def violation(self, g: Array, h: float) -> tuple[float, str]:
+    def violation(self, g: Array, t: Array) -> tuple[float, str]:
         """(largest violation of a constraint, which one: what, state, node, time)."""
         s = self.ocp.system
         excess = np.maximum(self.bounds["lbg"] - g, g - self.bounds["ubg"])
@@ -154,7 +154,7 @@ class Transcription:
             path = np.setdiff1d(np.arange(len(g)), self.gap_rows)  # node by node, from node 1
             i = int(np.flatnonzero(path == row)[0])
             node, what = 1 + i // self.n_path, f"path constraint {list(self.ocp.path_constraints)[i % self.n_path]!r}"
-        return float(excess[row]), f"{what} at node {node} ({self.N - node} intervals of {h:.4g} before the horizon)"
+        return float(excess[row]), f"{what} at node {node}, t = {t[node]:.4g}"
 
 
 def words(stats: dict[str, Any]) -> str:
