@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = {"systems": "nocl.systems", "solvers": "nocl.solvers", "comparisons": "nocl.comparisons"}
 CHAIN = ["lqr", "nmpc", "ddp", "cnd"]  # a solver may use those before it
 # files that are part of a link of the chain
-PARTS = {"transcription": "nmpc", "guesses": "nmpc", "ddp_kernel": "ddp", "bank": "cnd"}
+PARTS = {"transcription": "nmpc", "guesses": "nmpc", "ddp_kernel": "ddp", "bank": "ddp"}
 MAY_IMPORT = {"core": {"core"}, "systems": {"core", "systems"}, "solvers": {"core", "solvers"},
               "comparisons": {"core", "systems", "solvers", "comparisons"},
               "top": {"core", "systems", "solvers", "comparisons", "top"}}

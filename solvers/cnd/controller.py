@@ -1,0 +1,131 @@
+"""The trained controller u = pi(x, t) and value V(x, t): numpy in and out, CasADi and C out, files in and out."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+
+from nocl import checks, store
+from nocl.checks import Array
+from nocl.nets import FeatureNet
+from nocl.ocp import OCP
+from nocl.to_casadi import to_casadi
+
+KIND = "cnd"  # the name of its file in a folder
+PRETRAINED = Path(__file__).resolve().parents[2] / "nocl" / "pretrained"
+
+
+class CND:
+    """A feedback controller trained on an OCP, with the value function that goes with it where it was trained.
+
+    Parameters
+    ----------
+    ocp : OCP
+    policy : FeatureNet (x, t) -> u
+    value : FeatureNet (x, t) -> V, optional
+    card : mapping
+        How it was made and how it scored: plain JSON data.
+    """
+
+    def __init__(self, ocp: OCP, policy: FeatureNet, value: FeatureNet | None = None,
+                 card: Mapping[str, Any] | None = None) -> None:
+        self.ocp, self.card = ocp, dict(card or {})
+        self.policy = policy.double().eval().requires_grad_(False)
+        self.value_net = None if value is None else value.double().eval().requires_grad_(False)
+
+    def __call__(self, x: ArrayLike, t: ArrayLike = 0.0) -> Array:
+        """u [nu] at a state [nx], or [B, nu] at [B, nx], and a time (one for all, or [B])."""
+        rows, single = self._states(x)
+        with torch.no_grad():
+            u = self.policy(*self._tensors(rows, t)).numpy()
+        return u[0] if single else u
+
+    def value(self, x: ArrayLike, t: ArrayLike = 0.0) -> Array:
+        """V(x, t), the cost-to-go: a number at [nx], or [B] at [B, nx]."""
+        rows, single = self._states(x)
+        with torch.no_grad():
+            V = self._value_net()(*self._tensors(rows, t)).numpy()[:, 0]
+        return V[0] if single else V
+
+    def value_gradient(self, x: ArrayLike, t: ArrayLike = 0.0) -> Array:
+        """dV/dx, the costate: [nx] at [nx], or [B, nx] at [B, nx]."""
+        rows, single = self._states(x)
+        states, times = self._tensors(rows, t)
+        states.requires_grad_(True)
+        (gradient,) = torch.autograd.grad(self._value_net()(states, times).sum(), states)
+        return gradient[0].numpy() if single else gradient.numpy()
+
+    def to_casadi(self, backend: str = "native", build_dir: str | os.PathLike[str] | None = None) -> ca.Function:
+        """policy:(x [nx], t) -> (u [nu]), a CasADi Function; backend "native" (MX, float64) or "l4casadi" (float32)."""
+        return self._export(self.policy, "policy", "u", backend, build_dir)
+
+    def value_to_casadi(self, backend: str = "native", build_dir: str | os.PathLike[str] | None = None) -> ca.Function:
+        """value:(x [nx], t) -> (V) as a CasADi Function."""
+        return self._export(self._value_net(), "value", "V", backend, build_dir)
+
+    def to_c(self, folder: str | os.PathLike[str]) -> Path:
+        """C99 source, header, test vectors and self-test of the controller in `folder`; returns it."""
+        from nocl.to_c import to_c
+
+        s = self.ocp.system
+        return to_c(self.to_casadi(), Path(folder), f"{s.name}_policy",
+                    bounds={"x": (s.lbx, s.ubx), "t": (0.0, self.ocp.horizon), "u": (s.lbu, s.ubu)},
+                    labels={"x": [s.unit(n) for n in s.state_names], "u": [s.unit(n) for n in s.control_names]},
+                    note=repr(self))
+
+    def save(self, folder: str | os.PathLike[str]) -> Path:
+        """Write controller, value, problem and card as one data-only file in `folder`."""
+        nets = {"policy": self.policy} | ({} if self.value_net is None else {"value": self.value_net})
+        return store.save(Path(folder), KIND, nets=nets, card={"ocp": self.ocp.to_data(), "card": self.card})
+
+    @classmethod
+    def load(cls, folder: str | os.PathLike[str]) -> CND:
+        """What `save` wrote; raises ValueError for a missing, damaged or foreign file."""
+        record = store.load(Path(folder), KIND)
+        try:
+            ocp, nets = OCP.from_data(record.card["ocp"]), record.nets
+            return cls(ocp, nets["policy"], nets.get("value"), record.card["card"])
+        except KeyError as error:
+            raise ValueError(f"{folder}: not a controller written by nocl: {error} is missing") from None
+
+    def __repr__(self) -> str:
+        facts = ", ".join(f"{k} {v}" for k, v in self.card.items() if isinstance(v, (str, int, float)))
+        return f"CND on {self.ocp.system.name!r}: {facts or 'no card'}"
+
+    def _states(self, x: ArrayLike) -> tuple[Array, bool]:
+        return checks.states(x, self.ocp.system.nx, self.ocp.system.name, "x")
+
+    def _tensors(self, rows: Array, t: ArrayLike) -> tuple[torch.Tensor, torch.Tensor]:
+        times = np.asarray(t, dtype=np.float64)
+        if times.shape not in ((), (len(rows),)) or not ((times >= 0) & (times <= self.ocp.horizon * (1 + 1e-9))).all():
+            raise ValueError(f"t is {np.array2string(times, threshold=4)}; expected one time or {len(rows)}, "
+                             f"each in [0, {self.ocp.horizon:g}]")
+        return torch.from_numpy(rows.copy()), torch.from_numpy(np.broadcast_to(times, len(rows)).copy())[:, None]
+
+    def _value_net(self) -> FeatureNet:
+        if self.value_net is None:
+            raise ValueError(f"this controller of {self.ocp.system.name} was trained without a value function: "
+                             "train with settings that have value=True")
+        return self.value_net
+
+    def _export(self, net: FeatureNet, name: str, out: str, backend: str, build_dir: Any) -> ca.Function:
+        return to_casadi(net, backend=backend, name=name, build_dir=build_dir, in_names=["x", "t"], out_names=[out])
+
+
+def pretrained(name: str, dynamics: str = "exact") -> CND:
+    """A controller that comes with nocl, trained on the exact f or on a learned one (dynamics="learned")."""
+    if dynamics not in ("exact", "learned"):
+        raise ValueError(f"dynamics is {dynamics!r}; expected 'exact' or 'learned'")
+    folder = PRETRAINED / f"{name}-{dynamics}"
+    if not folder.is_dir():
+        there = ", ".join(sorted(p.name for p in PRETRAINED.glob("*-*"))) or "none"
+        raise ValueError(f"no pretrained controller {name!r} on {dynamics} dynamics; there are: {there}. "
+                         f"Train one: nocl.train(nocl.load_ocp({name!r}))")
+    return CND.load(folder)

@@ -1,0 +1,93 @@
+"""What the networks of a controller and a value see and say, as SX maps in physical units, scaled by the labels.
+
+Features of (x, t): the state in units of its spread at that time about its mean at that time (both polynomials in t),
+sine and cosine of angles, time, the logarithm of the time to go, and the distance to the goal over the time to go: the
+optimal gain grows like 1 / (T - t).
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import casadi as ca
+import numpy as np
+
+from nocl.checks import Array
+from nocl.nets import MLP, FeatureNet
+from nocl.ocp import OCP
+
+if TYPE_CHECKING:
+    from nocl.solvers.cnd.labels import Labels
+
+DEGREE = 6  # of the polynomials in time
+LEAST_TIME = 0.025  # of the horizon: time to go is never counted as less
+
+
+def features(ocp: OCP, x: Array, t: Array) -> ca.Function:
+    """(x, t) -> phi, each feature with mean 0 and standard deviation 1 over the labels x [n, nx], t [n]."""
+    s, time = ocp.system, ca.SX.sym("t")
+    tau = 2 * time / ocp.horizon - 1
+    to_go = ca.fmax(ocp.horizon - time, 0)
+    mean, spread = _moments_in_time(x, 2 * t / ocp.horizon - 1)
+    standard = (s.x - _polynomial(mean, tau)) / ca.exp(_polynomial(spread, tau))
+    angles = [g(s.x[i]) for i in s.angle_indices for g in (ca.sin, ca.cos)]
+    rush = (s.x - ca.DM(ocp.x_goal)) / (to_go + LEAST_TIME * ocp.horizon)
+    clock = ca.vertcat(tau, ca.log(to_go / ocp.horizon + LEAST_TIME) / 2)
+    raw = ca.vertcat(standard, *angles, clock, rush)
+    values = ca.Function("raw", [s.x, time], [raw])(x[:20_000].T, t[None, :20_000]).full()
+    centre, width = values.mean(axis=1), values.std(axis=1) + 1e-6
+    return ca.Function("features", [s.x, time], [(raw - ca.DM(centre)) / ca.DM(width)], ["x", "t"], ["phi"])
+
+
+def _moments_in_time(x: Array, tau: Array) -> tuple[Array, Array]:
+    """Chebyshev coefficients [nx, DEGREE+1] of the mean and of the log standard deviation of x at tau in [-1, 1]."""
+    bins = np.clip(((tau + 1) * 10).astype(int), 0, 19)
+    centres = [tau[bins == b].mean() for b in range(20) if (bins == b).sum() > 8]
+    groups = [x[bins == b] for b in range(20) if (bins == b).sum() > 8]
+    floor = 0.05 * x.std(axis=0) + 1e-6
+    degree = min(DEGREE, max(len(centres) - 1, 0))
+    mean = np.polynomial.chebyshev.chebfit(centres, [g.mean(axis=0) for g in groups], degree)
+    spread = np.polynomial.chebyshev.chebfit(centres, [np.log(g.std(axis=0) + floor) for g in groups], degree)
+    return mean.T, spread.T
+
+
+def _polynomial(coefficients: Array, tau: ca.SX) -> ca.SX:
+    basis = [ca.SX(1), tau]
+    while len(basis) < coefficients.shape[1]:
+        basis.append(2 * tau * basis[-1] - basis[-2])
+    return ca.DM(coefficients) @ ca.vertcat(*basis[: coefficients.shape[1]])
+
+
+def policy_net(ocp: OCP, labels: Labels, sizes: tuple[int, ...]) -> tuple[FeatureNet, ca.Function]:
+    """(u = clip(mean + spread * y, U), y a tanh network of the features; and u -> y, its inverse inside U)."""
+    s, time = ocp.system, ca.SX.sym("t")
+    phi = features(ocp, labels.x, labels.t)
+    mean, spread = ca.DM(labels.u.mean(axis=0)), ca.DM(labels.u.std(axis=0) + 1e-9)
+    y, u = ca.SX.sym("y", s.nu), ca.SX.sym("u", s.nu)
+    clipped = ca.fmin(ca.fmax(mean + spread * y, ca.DM(s.lbu)), ca.DM(s.ubu))
+    outputs = ca.Function("controls", [s.x, time, y], [clipped], ["x", "t", "y"], ["u"])
+    net = FeatureNet(phi, [MLP([phi.numel_out(0), *sizes, s.nu])], outputs)
+    return net, ca.Function("inverse", [u], [(u - mean) / spread], ["u"], ["y"])
+
+
+def value_net(ocp: OCP, labels: Labels, sizes: tuple[int, ...]) -> tuple[FeatureNet, ca.Function]:
+    """V of a tanh network y of the features, and V -> y, its inverse.
+
+    Where every label is positive, V = exp(a + b y) - offset, so that y's errors are relative errors of V; otherwise
+    V = a + b y.
+    """
+    s, time = ocp.system, ca.SX.sym("t")
+    phi = features(ocp, labels.node_x, labels.node_t)
+    y, V = ca.SX.sym("y"), ca.SX.sym("V")
+    labelled = labels.V
+    if labelled.min() >= 0:
+        offset = max(0.01 * float(np.median(labelled)), 1e-9)
+        logs = np.log(labelled + offset)
+        a, b = float(logs.mean()), float(logs.std()) + 1e-9
+        forward, inverse = ca.exp(a + b * y) - offset, (ca.log(V + offset) - a) / b
+    else:
+        a, b = float(labelled.mean()), float(labelled.std()) + 1e-9
+        forward, inverse = a + b * y, (V - a) / b
+    outputs = ca.Function("value", [s.x, time, y], [forward], ["x", "t", "y"], ["V"])
+    net = FeatureNet(phi, [MLP([phi.numel_out(0), *sizes, 1])], outputs)
+    return net, ca.Function("inverse", [V], [inverse], ["V"], ["y"])

@@ -1,0 +1,126 @@
+"""Optimal answers to learn from: DDP solutions in a tube about the optimal trajectories and where the policy goes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from nocl.checks import Array
+from nocl.integrate import rk4
+from nocl.ocp import OCP
+from nocl.solvers.bank import SolutionBank, better
+from nocl.solvers.ddp import DDP, DDPSolution
+from nocl.to_torch import to_torch
+
+Field = Callable[[Tensor, Tensor], Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """Controls at the middle of each interval, where a held control equals the continuous one to second order; values
+    at its start."""
+
+    x: Array  # [n, nx]
+    t: Array  # [n]
+    u: Array  # [n, nu]
+    weight: Array  # [n], the length of the interval
+    node_x: Array  # [n, nx]
+    node_t: Array  # [n]
+    V: Array  # [n]
+    V_x: Array  # [n, nx]
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __getitem__(self, rows: slice) -> Labels:
+        return Labels(*(getattr(self, name)[rows] for name in Labels.__dataclass_fields__))
+
+    @staticmethod
+    def of(solution: DDPSolution, f: Field) -> Labels:
+        """Every interval of every solution that succeeded; f in torch gives the states between nodes."""
+        s = solution[solution.success]
+        h = np.diff(s.t[:, :2], axis=1)
+        B, K, nu = s.u.shape
+        x, u, step = s.x[:, :-1].reshape(B * K, -1), s.u.reshape(-1, nu), np.repeat(h, K)
+        t = s.t[:, :-1].ravel()
+        with torch.no_grad():
+            half = torch.from_numpy(step / 2)[:, None]
+            middle = rk4(f, torch.from_numpy(x), torch.from_numpy(u), half).numpy()
+        return Labels(middle, t + step / 2, u, step, x, t, s.V[:, :-1].ravel(), s.V_x[:, :-1].reshape(B * K, -1))
+
+    @staticmethod
+    def join(parts: list[Labels]) -> Labels:
+        return Labels(*(np.concatenate([getattr(p, name) for p in parts]) for name in Labels.__dataclass_fields__))
+
+
+def tube(ddp: DDP, bank: SolutionBank, n: int, width: float, rng: np.random.Generator) -> DDPSolution:
+    """Tails from n random states near the bank's trajectories: x(t0) + width * exp(U(-1.5, 0)) * scale * N(0, I)."""
+    rows = rng.integers(0, len(bank), n)
+    t0 = rng.uniform(0, 0.97 * ddp.ocp.horizon, n)
+    x = bank.states(rows, t0[:, None])[:, 0]
+    x += width * np.exp(rng.uniform(-1.5, 0, (n, 1))) * bank.scale * rng.standard_normal(x.shape)
+    return ddp.solve(x, t0, **bank.guess(rows, t0))
+
+
+def visited(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, n: int, kick: float,
+            rng: np.random.Generator) -> DDPSolution:
+    """Tails from n states that the policy visits under kicks, the better of a start from the policy's own answer and
+    one from the nearest solution of the bank."""
+    ocp = ddp.ocp
+    x0 = ocp.initial_states.sample(max(n // 8, 1), rng)
+    t, x = kicked_rollout(ocp, policy, f, x0, kick * bank.scale, rng)
+    rows, k = rng.integers(0, len(x), n), rng.integers(0, len(t) - 1, n)
+    x, t0 = x[rows, k], t[k]
+    fine = np.isfinite(x).all(axis=1) & (np.abs(x) < 10 * np.abs(np.asarray(ocp.system.ubx))).all(axis=1)
+    x, t0 = x[fine], t0[fine]
+    own = ddp.solve(x, t0, u=policy_controls(policy, f, x, t0, ocp.horizon, ddp.intervals))
+    near = ddp.solve(x, t0, **bank.guess(bank.nearest(x, t0)[:, 0], t0))
+    return better(own, near)
+
+
+def kicked_rollout(ocp: OCP, policy: torch.nn.Module, f: Field, x0: Array, kick: Array, rng: np.random.Generator,
+                   steps: int = 160, kicks: int = 6) -> tuple[Array, Array]:
+    """The policy's states (t [steps+1], x [B, steps+1, nx]) from x0, pushed by N(0, kick^2) at `kicks` random times."""
+    h = ocp.horizon / steps
+    x, path = torch.from_numpy(x0), [x0]
+    times = rng.integers(0, steps, (kicks, len(x0)))
+    with torch.no_grad():
+        for k in range(steps):
+            push = (times == k).sum(axis=0)[:, None] * kick * rng.standard_normal(x0.shape)
+            x = x + torch.from_numpy(push)
+            u = policy(x, torch.full((len(x), 1), (k + 0.5) * h, dtype=x.dtype))
+            x = rk4(f, x, u, h)
+            path.append(x.numpy())
+    return np.linspace(0, ocp.horizon, steps + 1), np.stack(path, axis=1)
+
+
+def policy_controls(policy: torch.nn.Module, f: Field, x: Array, t0: Array, horizon: float, K: int) -> Array:
+    """The controls [B, K, nu] that the policy gives from (x, t0), each held over an interval of [t0, T]."""
+    state, start = torch.from_numpy(x), torch.from_numpy(t0)[:, None]
+    h = (horizon - start) / K
+    controls = []
+    with torch.no_grad():
+        for k in range(K):
+            controls.append(policy(state, start + (k + 0.5) * h))
+            state = rk4(f, state, controls[-1], h)
+    return torch.stack(controls, dim=1).numpy()
+
+
+def continuous_cost(ocp: OCP, policy: torch.nn.Module, f: Field, x0: Array, steps: int) -> Array:
+    """J [B] of the policy as continuous feedback from x0, by RK4 on (x, t, cost); soft path constraints included."""
+    n, L = x0.shape[1], to_torch(ocp.L_soft)
+
+    def closed_loop(z: Tensor, _: None) -> Tensor:
+        x, t = z[:, :n], z[:, n:n + 1]
+        u = policy(x, t)
+        return torch.cat([f(x, u), torch.ones_like(t), L(x, u)], dim=1)
+
+    z = torch.cat([torch.from_numpy(x0), torch.zeros(len(x0), 2, dtype=torch.float64)], dim=1)
+    with torch.no_grad():
+        for _ in range(steps):
+            z = rk4(closed_loop, z, None, ocp.horizon / steps)
+        return (z[:, n + 1] + to_torch(ocp.G)(z[:, :n])[:, 0]).numpy()

@@ -1,0 +1,103 @@
+"""Fitting a policy or value network to labels by SOAP (Vyas et al. 2024), float32, cosine schedule."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import torch
+from torch import Tensor
+
+from nocl.checks import Array
+from nocl.nets import FeatureNet
+from nocl.ocp import OCP
+from nocl.solvers.cnd.labels import Labels
+from nocl.to_torch import to_torch
+
+Loss = Callable[[Tensor], Tensor]  # row numbers of the labels -> a scalar
+Report = Callable[[float], Any]  # told the loss of each iteration
+
+
+def fit(net: FeatureNet, loss: Loss, rows: int, *, iterations: int, batch: int, lr: float, seed: int,
+        report: Report = lambda _: None) -> None:
+    """Train net in place on random batches of row numbers; raises ValueError where the loss is not finite."""
+    from pytorch_optimizer import SOAP
+
+    generator = torch.Generator().manual_seed(seed)
+    net.float().train().requires_grad_(True)
+    parameters = list(net.parameters())
+    optimizer = SOAP(parameters, lr=lr, betas=(0.95, 0.95), weight_decay=0.0, precondition_frequency=10)
+    for i in range(iterations):
+        optimizer.param_groups[0]["lr"] = lr * min(1.0, (i + 1) / 50) * _cosine(i / iterations)
+        value = loss(torch.randint(rows, (batch,), generator=generator))
+        if i % 100 == 0 and not torch.isfinite(value):
+            raise ValueError(f"the loss is {float(value)} at iteration {i}: lower the learning rate (lr is {lr:g})")
+        optimizer.zero_grad()
+        value.backward()
+        optimizer.step()
+        report(float(value.detach()))
+    net.double().eval().requires_grad_(False)
+
+
+def _cosine(progress: float) -> float:
+    return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress))
+
+
+def policy_loss(ocp: OCP, net: FeatureNet, inverse: ca.Function, labels: Labels) -> Loss:
+    """Mean of h (u - u*)' R (u - u*), R from L: for control-affine problems the cost lost along the labelled paths.
+
+    Answers beyond a bound that is active in the label cost nothing: they are clipped to it.
+    """
+    to_y = to_torch(inverse)
+    target = to_y(torch.from_numpy(labels.u)).float()
+    low, high = (to_y(torch.from_numpy(np.array(b))[None]).float() for b in (ocp.system.lbu, ocp.system.ubu))
+    lowest, highest = target <= low + 1e-4, target >= high - 1e-4
+    weight = torch.from_numpy(labels.weight / labels.weight.mean()).float()[:, None] * _control_weights(ocp, low, high)
+    (phi,) = _features(net, labels.x, labels.t)
+
+    def loss(rows: Tensor) -> Tensor:
+        y, wanted = net.nets[0](phi[rows]), target[rows]
+        free = ~((lowest[rows] & (y < wanted)) | (highest[rows] & (y > wanted)))
+        return (weight[rows] * free * (y - wanted) ** 2).mean()
+
+    return loss
+
+
+def _control_weights(ocp: OCP, low: Tensor, high: Tensor) -> Tensor:
+    """The diagonal of L_uu at the goal in the network's units [1, nu], mean 1; equal where it is not positive."""
+    s = ocp.system
+    second = ca.Function("second", [s.x, s.u], [ca.diag(ca.hessian(ocp.running, s.u)[0])])
+    H = torch.from_numpy(second(ocp.x_goal, ocp.u_goal).full().T.copy()).float()
+    unit = torch.from_numpy(np.asarray(s.ubu) - s.lbu).float() / (high - low)  # u for one unit of y
+    weights = H * unit**2 if bool((H > 0).all()) else torch.ones(1, s.nu)
+    return weights / weights.mean()
+
+
+def value_loss(net: FeatureNet, inverse: ca.Function, labels: Labels, scale: Array, slope_weight: float = 1.0) -> Loss:
+    """Mean square error of y and of its gradient in x, in units of `scale` [nx] and of their own mean squares."""
+    V = torch.from_numpy(labels.V)[:, None].requires_grad_(True)
+    y = to_torch(inverse)(V)
+    (dy_dV,) = torch.autograd.grad(y.sum(), V)
+    unit = torch.from_numpy(scale).float()
+    target = y.detach().float()
+    slope = (dy_dV * torch.from_numpy(labels.V_x)).float() * unit
+    slope_weight = slope_weight / float(slope.square().sum(dim=1).mean())
+    x, t = torch.from_numpy(labels.node_x).float(), torch.from_numpy(labels.node_t).float()[:, None]
+
+    def loss(rows: Tensor) -> Tensor:
+        state = x[rows].requires_grad_(True)
+        (phi,) = net.features(state, t[rows])
+        y = net.nets[0](phi)
+        (dy,) = torch.autograd.grad(y.sum(), state, create_graph=True)
+        off = (dy * unit - slope[rows]).square().sum(dim=1).mean()
+        return (y - target[rows]).square().mean() + slope_weight * off
+
+    return loss
+
+
+def _features(net: FeatureNet, x: Array, t: Array) -> tuple[Tensor, ...]:
+    """The features of all labels, in float32."""
+    return tuple(p.float() for p in net.features(torch.from_numpy(x), torch.from_numpy(t)[:, None]))
