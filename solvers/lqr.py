@@ -23,6 +23,7 @@ from nocl.ocp import OCP
 
 DEGREE = 5  # of the spline through P(t)
 REFINE = 3  # spline nodes for each step of the Riccati integration
+ESCAPE = 1e12  # entries of P beyond this: the Riccati solution has escaped to infinity
 STATIONARY = 1e-8  # largest |f| and |gradient| at the goal pair, beyond which it is no equilibrium
 
 
@@ -52,14 +53,19 @@ class LQR:
 
         def backward(s: float, p: Array) -> Array:
             P = p.reshape(n, n)
+            P = (P + P.T) / 2  # rounding's skew part would grow
+            if np.abs(P).max() > ESCAPE:
+                raise ValueError(f"LQR of {self.ocp.system.name!r}: the Riccati equation has no solution before t = "
+                                 f"{T - s:.4g}; expected one on [0, {T:g}]: L may not be convex at the goal, change it "
+                                 "or shorten the horizon")
             K = self._gain(P)
             return (self.Q + self.A.T @ P + P @ self.A - K.T @ self.R @ K).ravel()
 
         path = solve_ivp(backward, (0.0, T), self.P_final.ravel(), method="LSODA", rtol=1e-11, atol=1e-12,
                          dense_output=True)
         if not path.success:
-            raise ValueError(f"LQR of {self.ocp.system.name!r}: the Riccati equation has no solution on [0, {T:g}] "
-                             f"({path.message}): L may not be convex at the goal; shorten the horizon")
+            raise ValueError(f"LQR of {self.ocp.system.name!r}: the Riccati equation was not solved: {path.message}; "
+                             "scale the states and costs")
         fine = np.linspace(0, 1, REFINE, endpoint=False)
         s = np.r_[(path.t[:-1, None] + np.diff(path.t)[:, None] * fine).ravel(), T]
         return make_interp_spline(T - s[::-1], path.sol(s).T[::-1], k=DEGREE)
