@@ -61,18 +61,18 @@ def rollout(policy: Map, dynamics: Map, L: Map, x0: Tensor, T: float, K: int, *,
             step: Step = rk4_cost) -> Rollout:
     """Trajectories from x0 [B, nx] over [t0, T] in K equal steps; the policy is asked at each node and held.
 
-    Differentiable in whatever policy, dynamics, L and x0 depend on.
+    Differentiable in whatever policy, dynamics, L and x0 depend on. More batch dimensions may stand in place of B.
     """
-    h, x = (T - t0) / K, x0
-    states, controls, running = [x0], [], x0.new_zeros(len(x0), 1)
+    h, x, column = (T - t0) / K, x0, (*x0.shape[:-1], 1)
+    states, controls, running = [x0], [], x0.new_zeros(column)
     for k in range(K):
-        u = policy(x, x0.new_full((len(x0), 1), t0 + k * h))
+        u = policy(x, x0.new_full(column, t0 + k * h))
         x, cost = step(dynamics, L, x, u, h)
         running = running + cost
         states.append(x)
         controls.append(u)
     t = torch.linspace(t0, T, K + 1, dtype=x0.dtype, device=x0.device)
-    return Rollout(t, torch.stack(states, 1), torch.stack(controls, 1), running)
+    return Rollout(t, torch.stack(states, -2), torch.stack(controls, -2), running)
 
 
 def hamiltonian(dynamics: Map, L: Map, x: Tensor, u: Tensor, costate: Tensor) -> Tensor:
