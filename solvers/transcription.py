@@ -106,7 +106,12 @@ class Transcription:
         if self.backend == "fatrop":
             options |= {"structure_detection": "manual", "N": N, "nx": [s.nx] * (N + 1), "nu": [s.nu] * N + [0],
                         "ng": [s.nx] + [m] * N}
-        return ca.nlpsol("nmpc", self.backend, self.program, {**options, **dict(self.options)})
+        try:
+            return ca.nlpsol("nmpc", self.backend, self.program, {**options, **dict(self.options)})
+        except RuntimeError as error:
+            reason = str(error).strip().splitlines()[-1]
+            raise ValueError(f"NMPC: {self.backend} could not be built with options {dict(self.options)}: {reason}; "
+                             "give options by CasADi's names, like {'ipopt.tol': 1e-6}") from error
 
     @cached_property
     def bounds(self) -> dict[str, Array]:
@@ -137,7 +142,8 @@ class Transcription:
         status = words(stats)
         success = bool(stats["success"]) and worst <= FEASIBLE and np.isfinite(X).all()
         if not success:
-            status += f"; worst violation {worst:.3g} of {where}"
+            status += f"; worst violation {worst:.3g} of {where}" if worst > FEASIBLE else \
+                ", at a feasible point that may not be optimal"
         cost = float(result["f"]) if success else np.inf
         return Answer(X, U, costate, cost, success, status, worst, int(stats.get("iter_count", 0)))
 
@@ -163,4 +169,6 @@ def words(stats: dict[str, Any]) -> str:
     plain = {"SOLVER_RET_SUCCESS": "solved", "SOLVER_RET_LIMITED": "stopped at its limit of iterations or time",
              "SOLVER_RET_INFEASIBLE": "infeasible", "SOLVER_RET_NAN": "NaN in a function",
              "SOLVER_RET_UNKNOWN": "not converged"}.get(unified, unified.lower())
+    if "Infeasible" in str(status):
+        plain = "infeasible"
     return f"{plain} ({status})" if isinstance(status, str) and status else plain

@@ -168,6 +168,13 @@ def test_an_infeasible_state_is_a_row_that_says_why(solver):
         assert words in solution.message[0]
 
 
+def test_out_of_iterations_is_told():
+    solution = NMPC(walled(), 15, solver="ipopt", starts=1, options={"ipopt.max_iter": 1}).solve([1.0, -1.0])
+    assert not solution.success[0]
+    assert "limit of iterations" in solution.message[0]
+    assert "feasible point" in solution.message[0]
+
+
 def test_a_start_behind_the_wall_is_refused_with_its_distance():
     solution = NMPC(walled(), 15, starts=2).solve([[-0.7, 0.0], [1.0, 0.0]])
     assert solution.success.tolist() == [False, True]
@@ -255,6 +262,7 @@ def test_pickle_and_cache():
     (lambda n: NMPC(n.ocp, solver="snopt9"), "solver is 'snopt9'"),
     (lambda n: NMPC(n.ocp, constraints="none"), "constraints is 'none'"),
     (lambda n: NMPC(n.ocp, dynamics=3), "the dynamics are a int"),
+    (lambda n: NMPC(n.ocp, 10, solver="ipopt", options={"ipopt.max_it": 3}).solve([1.0, 0.0]), "max_it"),
 ])
 def test_bad_input(call, words):
     nmpc = NMPC(nocl.load_ocp("double_integrator"), 10)
