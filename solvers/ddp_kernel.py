@@ -17,7 +17,7 @@ Columns = list[ca.SX]
 
 
 def pack_weights(net: Any) -> Array:
-    """All networks' weights in one array, in the order that csrc/mlp.h reads."""
+    """All networks' weights in one array, in the order that csrc/mlp.h reads; one number unused before them."""
     parts = []
     for mlp in net.nets:
         for layer in mlp.body:
@@ -25,7 +25,7 @@ def pack_weights(net: Any) -> Array:
                 parts += [layer.weight, layer.bias]
         if mlp.skip is not None:
             parts.append(mlp.skip.weight)
-    return np.concatenate([p.detach().double().cpu().numpy().ravel() for p in parts])
+    return np.concatenate([np.zeros(1), *(p.detach().double().cpu().numpy().ravel() for p in parts)])
 
 
 def ddp_source(ocp: OCP, net: Any = None) -> str:
@@ -61,7 +61,7 @@ class _Stage:
         self.J = ca.jacobian(self.rhs, z)
         scalar = ca.dot(self.mu, self.rhs)
         H = ca.hessian(scalar, z)[0]
-        if net is not None:
+        if y:
             self.J += ca.jacobian(self.rhs, ys) @ yz
             v = ca.gradient(scalar, ys)
             cross = ca.jacobian(ca.gradient(scalar, z), ys) @ yz
@@ -72,7 +72,7 @@ class _Stage:
 
 def _network_symbols(net: Any, x: ca.SX, u: ca.SX) -> tuple[Columns, Columns, Columns, list[Columns], ca.SX]:
     """(features, values, gradients [out, d], Hessians [d, d] of each output, all symbols as csrc/mlp.h orders them)."""
-    if net is None:
+    if net is None or not net.nets:
         return [], [], [], [], ca.SX(0, 1)
     phi = list(net.inputs.call([x, u]))
     values, gradients, hessians, symbols = [], [], [], []
@@ -136,10 +136,10 @@ def _chain(n: int, m: int, J_pattern: ca.Sparsity, W_pattern: ca.Sparsity) -> li
 def _networks(ocp: OCP, net: Any) -> str:
     """C of networks(): features by generated code, then each MLP."""
     head = "static void networks(const double *weights, const lane *x, const lane *u, int order, lane *net)\n{\n"
-    if net is None:
+    if net is None or not net.nets:
         return head + "    (void)weights; (void)x; (void)u; (void)order; (void)net;\n}\n"
     x, u = ocp.system.x, ocp.system.u
-    lines, weight, first_phi, first_net = [], 0, 0, 0
+    lines, weight, first_phi, first_net = [], 1, 0, 0
     for mlp in net.nets:
         sizes, d = mlp.sizes, mlp.sizes[0]
         full, widest = 1 + d + d * (d + 1) // 2, max(mlp.sizes)
