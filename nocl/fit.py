@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
+from scipy.linalg.blas import ssyrk
 from torch import Tensor
 
 Weights = list[Tensor]  # W1, W2, W3
@@ -147,20 +148,39 @@ def _step(weights: Weights, JJ: Tensor, Jr: Tensor, damping: float) -> Weights |
 
 def gauss_newton(weights: Sequence[Tensor], batch: Batch, scale: Tensor,
                  chunk: int = 512) -> tuple[Tensor, Tensor, float]:
-    """(J'J [P, P], J'r [P], r'r) over the batch, divided by B: J in float32, the residual r and the sums in float64."""
+    """(J'J [P, P], J'r [P], r'r) over the batch, divided by B: J in float32, the residual r and the sums in float64.
+
+    An output's residuals see only their own row of W3, so the products are taken output by output.
+    """
     r = (forward([w.double() for w in weights], batch.phi.double()) - batch.y) * scale  # [1+k, B, m]
-    single, P, B = [w.float() for w in weights], sum(w.numel() for w in weights), r.shape[1]
+    single, P, (_, B, m) = [w.float() for w in weights], sum(w.numel() for w in weights), r.shape
+    hidden, own = sum(w.numel() for w in weights[:2]), weights[2].shape[1]
     JJ, Jr = torch.zeros(P, P, dtype=torch.float64), torch.zeros(P, dtype=torch.float64)
     for start in range(0, B, chunk):
         rows = slice(start, start + chunk)
-        J = parameter_jacobian(single, batch.phi[:, rows].float()).mul_(scale.float()[..., None]).view(-1, P)
-        JJ += (J.T @ J).double()
-        Jr += (J.T @ r[:, rows].reshape(-1).float()).double()
+        J = parameter_jacobian(single, batch.phi[:, rows].float())  # [m, 1+k, B, hidden + own]
+        J *= scale.float().permute(2, 0, 1)[..., None]
+        for o in range(m):
+            Jo = J[o].view(-1, hidden + own)
+            last = slice(hidden + o * own, hidden + (o + 1) * own)
+            square = _upper(Jo)
+            JJ[:hidden, :hidden] += square[:hidden, :hidden]
+            JJ[:hidden, last] += square[:hidden, hidden:]
+            JJ[last, last] += square[hidden:, hidden:]
+            product = (Jo.T @ r[:, rows, o].reshape(-1).float()).double()
+            Jr[:hidden] += product[:hidden]
+            Jr[last] += product[hidden:]
+    JJ = JJ.triu() + JJ.triu(1).T
     return JJ / B, Jr / B, float(r.square().sum() / B)
 
 
+def _upper(J: Tensor) -> Tensor:
+    """The upper triangle of J'J: half of the work of the product."""
+    return torch.from_numpy(ssyrk(1.0, J.numpy().T))
+
+
 def parameter_jacobian(weights: Sequence[Tensor], phi: Tensor) -> Tensor:
-    """d forward / d(W1, W2, W3), each flattened by rows: [1+k, B, m, P], by reverse mode written out."""
+    """d forward[..., o] / d(W1, W2, W3[o]), flattened by rows: [m, 1+k, B, .], by reverse mode written out."""
     W1, W2, W3 = weights
     (D, B, F), h, m = phi.shape, W1.shape[0], W3.shape[0]
     one = torch.zeros(D, B, 1, dtype=phi.dtype)
@@ -171,20 +191,19 @@ def parameter_jacobian(weights: Sequence[Tensor], phi: Tensor) -> Tensor:
     t2 = a1 @ W2[:, :h].T
     s2, c2 = torch.sin(t2[0] + W2[:, h]), torch.cos(t2[0] + W2[:, h])
     a2 = torch.cat([s2[None], c2 * t2[1:]])
-    in1, in2, in3 = torch.cat([phi, one], 2), torch.cat([a1, one], 2), torch.cat([a2, one, phi], 2)
-    J = torch.zeros(D, B, m, sum(w.numel() for w in weights), dtype=phi.dtype)
-    J1, J2, J3 = J.split([w.numel() for w in weights], dim=3)
-    J1, J2, J3 = J1.view(D, B, m, h, F + 1), J2.view(D, B, m, h, h + 1), J3.view(D, B, m, m, h + 1 + F)
+    in1, in2 = torch.cat([phi, one], 2)[:, :, None, :], torch.cat([a1, one], 2)[:, :, None, :]
+    sizes = [W1.numel(), W2.numel(), W3.shape[1]]
+    J = torch.empty(m, D, B, sum(sizes), dtype=phi.dtype)
+    J1, J2, J3 = J.split(sizes, dim=3)
+    J1, J2 = J1.view(m, D, B, h, F + 1), J2.view(m, D, B, h, h + 1)
+    J3[:] = torch.cat([a2, one, phi], 2)
     for o in range(m):
-        J3[:, :, o, o] = in3
-        mu2 = W3[o, :h] * c2  # adjoint of the value (or of the tangent) before the second sine
+        mu2 = W3[o, :h] * c2  # adjoint of what enters the second sine, value and tangents alike
         back = mu2 @ W2[:, :h]
-        mu1 = back * c1
-        J1[:, :, o] = mu1[:, :, None] * in1[:, :, None, :]
-        J2[:, :, o] = mu2[:, :, None] * in2[:, :, None, :]
-        for d in range(1, D):  # a tangent's residual moves with the value before each sine as well
-            nu2 = -W3[o, :h] * s2 * t2[d]
-            nu1 = (nu2 @ W2[:, :h]) * c1 - back * s1 * t1[d]
-            J1[d, :, o] += nu1[:, :, None] * in1[0][:, None, :]
-            J2[d, :, o] += nu2[:, :, None] * in2[0][:, None, :]
+        J1[o] = (back * c1)[:, :, None] * in1
+        J2[o] = mu2[:, :, None] * in2
+        nu2 = -W3[o, :h] * s2 * t2[1:]  # a tangent's residual moves with the value before each sine as well
+        nu1 = (nu2 @ W2[:, :h]) * c1 - back * s1 * t1[1:]
+        J1[o, 1:] += nu1[..., None] * in1[0]
+        J2[o, 1:] += nu2[..., None] * in2[0]
     return J

@@ -144,7 +144,8 @@ class Expansion:
 
     def labels(self, entries: Labels, z: Array) -> tuple[Array, Array]:
         """Coefficients [N, n T] and their gradients [N, n T, nz] at rows z, from T labels of the entries a row."""
-        nodes = np.array(list(product(*(_nodes(self.box, k, d) for k, d in zip(self.variables, self.degrees, strict=True)))))
+        axes = [_nodes(self.box, k, d) for k, d in zip(self.variables, self.degrees, strict=True)]
+        nodes = np.array(list(product(*axes)))  # [T, |variables|]
         T, own, p = len(nodes), list(self.entries), list(self.variables)
         rows = np.repeat(z[None], T, axis=0)  # [T, N, nz]
         rows[:, :, p] = nodes[:, None, :]
@@ -209,6 +210,8 @@ class Structure:
 
     def residual(self, oracle: Oracle, z: Array) -> tuple[Array, Array]:
         """The networks' labels: coefficients [N, C] and gradients [N, C, nz] at rows z, less their exact parts."""
+        if not self.expansions:
+            return np.zeros((len(z), 0)), np.zeros((len(z), 0, self.split.box.nz))
         entries = _less(partial(self.split.labels, oracle), self.linear)
         parts = [expansion.labels(entries, z) for expansion in self.expansions]
         exact, slope = evaluate(self.exact, z)
@@ -256,7 +259,7 @@ def evaluate(function: ca.Function, z: Array) -> tuple[Array, Array]:
     """(value [N, r], Jacobian [N, r, nz]) of an SX function z -> (value, Jacobian) at rows z."""
     value, slope = (m.full() for m in function(z.T))
     rows = function.size1_out(0)
-    return value.T.reshape(len(z), rows), slope.reshape(rows, len(z), -1).transpose(1, 0, 2)
+    return value.T.reshape(len(z), rows), slope.reshape(rows, len(z), z.shape[1]).transpose(1, 0, 2)
 
 
 def _with_jacobian(z: ca.SX, expressions: Sequence[ca.SX]) -> ca.Function:
@@ -284,22 +287,26 @@ def find(oracle: Oracle, box: Box, *, seed: int = 0, probes: int = 64, features:
     first = _Stage(box, partial(split.labels, counter), split.scale, split.rest, rng, probes)
     known, left = first.exact(features)
     linear = _with_jacobian(first.z, known)
-    entries = _less(first.labels, linear)
+    entries, scale = _less(first.labels, linear), first.size()
     if features:
-        expansions = _expansions(box, entries, split.scale(first.labels(box.sample(probes, rng))[0]), left, rng, probes)
+        expansions = _expansions(box, entries, scale, left, rng, probes)
     else:
         expansions = (Expansion(box, tuple(left)),) if left else ()
     exact: list[ca.SX] = []
     learned: dict[int, tuple[int, ...]] = {}
     for expansion in expansions:
-        size = first.size()[list(expansion.entries)].repeat(expansion.terms)
+        size = scale[list(expansion.entries)].repeat(expansion.terms)
         rest = tuple(k for k in split.rest if k not in expansion.variables)
-        stage = _Stage(box, partial(expansion.labels, entries), lambda _, size=size: size, rest, rng, probes, first.z)
+        stage = _Stage(box, partial(expansion.labels, entries), _constant(size), rest, rng, probes, first.z)
         found, variables = stage.exact(features)
         learned |= {len(exact) + c: v for c, v in variables.items()}
         exact += found
-    structure = Structure(split, linear, tuple(expansions), _with_jacobian(first.z, exact), _grouped(learned), "", counter.n)
+    structure = Structure(split, linear, expansions, _with_jacobian(first.z, exact), _grouped(learned), "", counter.n)
     return replace(structure, words=describe(structure))
+
+
+def _constant(size: Array) -> Callable[[Array], Array]:
+    return lambda _: size
 
 
 def read(z: Array, value: Array, gradient: Array, box: Box, *, features: bool = True) -> Structure:
@@ -320,7 +327,7 @@ def read(z: Array, value: Array, gradient: Array, box: Box, *, features: bool = 
         return z[order[:n]], value[order[:n]]
 
     symbol = ca.SX.sym("z", box.nz)
-    known, left = _known(box, slopes, draw, split.scale, symbol, features and len(z) >= 40)
+    known, left = _known(box, slopes, draw, split.scale, symbol, range(box.nz), features and len(z) >= 40)
     expansions = (Expansion(box, tuple(left)),) if left else ()
     learned = {c: left[e] for c, e in enumerate(left)}
     structure = Structure(split, _with_jacobian(symbol, known), expansions,
@@ -347,12 +354,12 @@ class _Stage:
     def exact(self, features: bool) -> tuple[list[ca.SX], dict[int, tuple[int, ...]]]:
         """(each function's exact part, the variables of those that have more to them)."""
         slopes = _slopes(self.labels, self.scale, self.box, self.rest, self.rng, self.probes)
-        return _known(self.box, slopes, self.draw, self.scale, self.z, features)
+        return _known(self.box, slopes, self.draw, self.scale, self.z, self.rest, features)
 
 
 def _known(box: Box, slopes: Array, draw: Draw, scale: Callable[[Array], Array], z: ca.SX,
-           features: bool) -> tuple[list[ca.SX], dict[int, tuple[int, ...]]]:
-    """(exact parts, variables of what is not exact) from constant slopes [E, nz] and, for polynomials, fresh samples."""
+           rest: Sequence[int], features: bool) -> tuple[list[ca.SX], dict[int, tuple[int, ...]]]:
+    """(exact parts, variables of the others) from constant slopes [E, nz] and, for polynomials, fresh samples."""
     known = [_linear(row, z) for row in slopes]
     variables = {e: tuple(int(k) for k in np.flatnonzero(np.isnan(row))) for e, row in enumerate(slopes)}
     for group in _grouped(variables):
@@ -360,6 +367,9 @@ def _known(box: Box, slopes: Array, draw: Draw, scale: Callable[[Array], Array],
             for e, expression in _polynomials(box, draw, scale, group, known, z).items():
                 known[e] = known[e] + expression
                 del variables[e]
+    for e, own in variables.items():
+        if not own:  # looked linear at the probes, but is not at fresh points
+            known[e], variables[e] = ca.SX(0), tuple(rest)
     return known, variables
 
 
@@ -374,7 +384,8 @@ def _grouped(variables: Mapping[int, tuple[int, ...]]) -> tuple[Group, ...]:
 def _expansions(box: Box, entries: Labels, scale: Array, variables: Mapping[int, tuple[int, ...]],
                 rng: np.random.Generator, probes: int) -> tuple[Expansion, ...]:
     """The entries by the variables in which they are polynomials of a low degree."""
-    degree = {k: _degrees(box, entries, scale, k, rng, probes) for k in sorted({k for v in variables.values() for k in v})}
+    union = sorted({k for v in variables.values() for k in v})
+    degree = {k: _degrees(box, entries, scale, k, rng, probes) for k in union}
     kinds: dict[tuple[tuple[int, int], ...], list[int]] = {}
     for e, own in variables.items():
         chosen = [(k, int(degree[k][e])) for k in own if degree[k][e] > 0]
@@ -388,7 +399,8 @@ def _columns(pairs: Sequence[tuple[int, int]]) -> tuple[tuple[int, ...], tuple[i
     return tuple(k for k, _ in pairs), tuple(d for _, d in pairs)
 
 
-def _degrees(box: Box, entries: Labels, scale: Array, k: int, rng: np.random.Generator, probes: int) -> NDArray[np.int_]:
+def _degrees(box: Box, entries: Labels, scale: Array, k: int, rng: np.random.Generator,
+             probes: int) -> NDArray[np.int_]:
     """The lowest degree up to 3 of each entry in variable k (angles: 1, in sin and cos); 0 where there is none. [E]"""
     z = box.sample(probes, rng)
     values = box.lb[k] + box.width[k] * (np.arange(9) + rng.uniform(0.2, 0.8, 9)) / 9
@@ -554,8 +566,9 @@ def describe(structure: Structure) -> str:
         c += n * len(expansion.entries)
     words += [f"{_derivative(box, i)} = {_formula(structure, i)} exact" for i in range(box.nx) if i not in rows]
     words += polynomial
-    words += [f"{_count(len(g.coefficients))} of {_and(_derivative(box, i) for i in sorted(rows))} learned as functions of "
-              f"{_and(box.names[k] for k in g.variables)}" for g in structure.groups]
+    of = _and(_derivative(box, i) for i in sorted(rows)) if rows else ""
+    words += [f"{_count(len(g.coefficients))} of {of} learned as functions of {_and(box.names[k] for k in g.variables)}"
+              for g in structure.groups]
     return "; ".join(words)
 
 
@@ -571,7 +584,7 @@ def _derivative(box: Box, i: int) -> str:
 
 
 def _and(names: Iterable[str]) -> str:
-    *most, last = names
+    *most, last = names 
     return f"{', '.join(most)} and {last}" if most else last
 
 

@@ -16,10 +16,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import torch
+from numpy.typing import ArrayLike
 from torch import Tensor
 from tqdm import tqdm
 
-from nocl import fit, store
+from nocl import checks, fit, store
 from nocl import structure as structures
 from nocl.checks import Array
 from nocl.data import Dataset
@@ -38,29 +39,55 @@ FULL_JACOBIAN = 4  # variables up to which every derivative is supervised, beyon
 
 
 @dataclass(frozen=True)
-class Settings:
-    """Of methods "default" and "mlp"; every budget is per network."""
+class Budget:
+    """Of one network; more for functions of more variables."""
 
-    width: int | None = None  # of the two hidden layers; None: by the number of variables
-    samples: int = 200_000  # labels of f to draw (with data: ignored, all of it is used)
-    iterations: int = 2500  # of SOAP
-    batch: int = 1024
-    lr: float = 4e-3
-    polish: int = 30  # Levenberg-Marquardt steps, where the network is small enough
-    polish_batch: int = 2048
+    width: int  # of its two hidden layers
+    iterations: int  # of SOAP
+    batch: int
+    polish: int  # Levenberg-Marquardt steps
+    polish_batch: int
+
+    @staticmethod
+    def of(variables: int) -> Budget:
+        """What was enough for bundled systems: functions of one variable take seconds, of four about two minutes."""
+        if variables <= 1:
+            return Budget(16, 500, 256, 60, 512)
+        if variables <= 2:
+            return Budget(24, 2000, 1024, 40, 1024)
+        if variables <= 4:
+            return Budget(32, 3000, 1024, 60, 1024)
+        return Budget(48 if variables <= 6 else 96, 6000, 1024, 40, 1024)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Of methods "default" and "mlp". None: by the number of a network's variables, as in Budget.of."""
+
+    width: int | None = None
+    iterations: int | None = None
+    batch: int | None = None
+    polish: int | None = None  # Levenberg-Marquardt steps; none for networks of more than 2,600 parameters
+    polish_batch: int | None = None
+    lr: float = 4e-3  # of SOAP, cosine schedule
+    samples: int = 200_000  # labels of f to draw (with data: all of it is used, and no more)
     gradient_weight: float = 1.0  # of derivatives beside values, each in units of its own spread
     structure: bool = True  # read the structure off the Jacobian labels first
-    features: bool = True  # try polynomials in variables and sin, cos of angles before networks
+    features: bool = True  # look for polynomials in variables and sin, cos of angles
     angles: bool = True  # networks see angles as sin and cos
     probes: int = 64  # points at which the structure is looked for, for each variable
 
     def __post_init__(self) -> None:
-        _positive(self, ("samples", "batch", "polish_batch", "probes"), integer=True)
-        _positive(self, ("iterations", "polish"), integer=True, zero=True)
+        given = [n for n in ("width", "batch", "polish_batch") if getattr(self, n) is not None]
+        _positive(self, (*given, "samples", "probes"), integer=True)
+        _positive(self, [n for n in ("iterations", "polish") if getattr(self, n) is not None], integer=True, zero=True)
         _positive(self, ("lr",))
         _positive(self, ("gradient_weight",), zero=True)
-        if self.width is not None:
-            _positive(self, ("width",), integer=True)
+
+    def budget(self, variables: int) -> Budget:
+        """The budget of a network of so many variables."""
+        own = {name: getattr(self, name) for name in Budget.__dataclass_fields__}
+        return replace(Budget.of(variables), **{name: value for name, value in own.items() if value is not None})
 
 
 @dataclass(frozen=True)
@@ -80,9 +107,10 @@ class PaperSettings:
         _positive(self, ("width", "iterations", "batch", "samples"), integer=True)
         _positive(self, ("lr", "final_lr"))
         if not isinstance(self.layers, int) or self.layers < 2:
-            raise ValueError(f"PaperSettings: layers is {self.layers!r}; expected an integer >= 2: one hidden layer or more")
+            raise ValueError(f"PaperSettings: layers is {self.layers!r}; expected an integer >= 2")
         if self.activation not in ACTIVATIONS:
-            raise ValueError(f"PaperSettings: activation is {self.activation!r}; expected one of {', '.join(ACTIVATIONS)}")
+            raise ValueError(f"PaperSettings: activation is {self.activation!r}; "
+                             f"expected one of {', '.join(ACTIVATIONS)}")
 
 
 def _positive(settings: Any, names: Sequence[str], *, integer: bool = False, zero: bool = False) -> None:
@@ -91,8 +119,8 @@ def _positive(settings: Any, names: Sequence[str], *, integer: bool = False, zer
         kind = int if integer else (int, float)
         good = isinstance(value, kind) and not isinstance(value, bool) and np.isfinite(value)
         if not good or value < 0 or (value == 0 and not zero):
-            raise ValueError(f"{type(settings).__name__}: {name} is {value!r}; expected {'an integer' if integer else 'a number'} "
-                             f"{'>= 0' if zero else '> 0'}")
+            what = f"{'an integer' if integer else 'a number'} {'>= 0' if zero else '> 0'}"
+            raise ValueError(f"{type(settings).__name__}: {name} is {value!r}; expected {what}")
 
 
 @dataclass(frozen=True)
@@ -135,6 +163,16 @@ class LearnedDynamics:
         """Errors against the exact f at n fresh uniform samples of the box X x U."""
         return _score(self.net, Dataset.sample(self.system, n, seed))
 
+    def refine(self, states: ArrayLike, controls: ArrayLike, *, spread: float = 0.05, share: float = 0.7, seed: int = 0,
+               settings: Settings | None = None, progress: bool = True) -> LearnedDynamics:
+        """More training where solutions go: `share` of the samples near rows (states [N, nx], controls [N, nu]).
+
+        Near: normal noise of `spread` times the width of the box; the other samples fill the box. The networks
+        go on from their weights; the structure stays. Asks the system for labels. Raises ValueError for rows that do
+        not fit, and for a model with nothing to train.
+        """
+        return _refined(self, states, controls, spread, share, seed, settings or Settings(), progress)
+
     def save(self, folder: str | Path) -> Path:
         """Write folder/dynamics.safetensors: weights, maps, the system's equations and the card, as data."""
         parts = None if self.parts is None else _structure_data(self.parts)
@@ -151,7 +189,8 @@ class LearnedDynamics:
         return LearnedDynamics(system, record.nets["f"].eval(), record.card["structure"], record.card["card"], parts)
 
     def __repr__(self) -> str:
-        sizes = ", ".join("-".join(map(str, net.sizes)) for net in self.net.nets) or "none: all in closed form"
+        nets = [net for net in self.net.nets if isinstance(net, MLP)]
+        sizes = ", ".join("-".join(map(str, net.sizes)) for net in nets) or "none: all in closed form"
         return (f"LearnedDynamics of {self.system.name!r} ({self.card.get('method', '?')})\n  {self.structure}\n"
                 f"  networks: {sizes}\n  {self.card.get('score', 'not scored')}")
 
@@ -206,7 +245,8 @@ def identify(system: System, *, data: Dataset | None = None, method: str = "defa
 def _check_arguments(system: System, method: str, settings: Settings | PaperSettings | None,
                      seed: int) -> Settings | PaperSettings:
     if not isinstance(system, System):
-        raise ValueError(f"identify: system is a {type(system).__name__}; expected a nocl.System: pass ocp.system for an OCP")
+        raise ValueError(f"identify: system is a {type(system).__name__}; expected a nocl.System: "
+                         "of an OCP, pass ocp.system")
     if method not in METHODS:
         raise ValueError(f"identify: method is {method!r}; expected one of {', '.join(METHODS)}")
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
@@ -221,7 +261,8 @@ def _check_arguments(system: System, method: str, settings: Settings | PaperSett
 
 
 def _box(system: System) -> Box:
-    return Box(system.names, np.r_[system.lbx, system.lbu], np.r_[system.ubx, system.ubu], system.nx, system.angle_indices)
+    lb, ub = np.r_[system.lbx, system.lbu], np.r_[system.ubx, system.ubu]
+    return Box(system.names, lb, ub, system.nx, system.angle_indices)
 
 
 @dataclass(eq=False)
@@ -287,11 +328,14 @@ def _find_structure(source: _Source, settings: Settings, seed: int) -> Structure
     if not settings.structure:
         return structures.plain(source.box)
     if not source.gradients:
-        return structures.plain(source.box, "no structure looked for, without Jacobian labels: one network of all variables")
+        return structures.plain(source.box, "without Jacobian labels no structure was looked for: "
+                                "one network of all variables")
     if source.oracle is not None:
         return structures.find(source.oracle, source.box, seed=seed, probes=settings.probes, features=settings.features)
-    assert source.data is not None and source.data[2] is not None
-    return structures.read(*source.data[:2], source.data[2], source.box, features=settings.features)
+    assert source.data is not None
+    z, value, gradient = source.data
+    assert gradient is not None
+    return structures.read(z, value, gradient, source.box, features=settings.features)
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,7 +348,7 @@ class _Pool:
 
 
 def _pool(source: _Source, parts: Structure, settings: Settings, rng: np.random.Generator) -> _Pool:
-    """Labels for every group: fresh uniform samples of the box, or all of the data."""
+    """Labels for every group: at fresh uniform samples of the box, or all of the data."""
     if source.data is not None:
         z, value, gradient = source.data
         own = [e for expansion in parts.expansions for e in expansion.entries]  # without variables: entries of f
@@ -312,8 +356,19 @@ def _pool(source: _Source, parts: Structure, settings: Settings, rng: np.random.
         known, slope = structures.evaluate(parts.linear, z)
         return _collect([(z, (value - known)[:, own], (jacobian - slope)[:, own])], parts, gradient is not None)
     assert source.oracle is not None
-    z = source.box.sample(max(settings.samples // parts.cost, MIN_ROWS), rng)
-    chunks = ((rows, *parts.residual(source.oracle, rows)) for rows in np.array_split(z, -(-len(z) * parts.cost // CHUNK)))
+    z = source.box.sample(_rows(parts, settings), rng)
+    return _labelled(source, parts, z)
+
+
+def _rows(parts: Structure, settings: Settings) -> int:
+    """How many rows the budget of labels buys."""
+    return max(settings.samples // parts.cost, MIN_ROWS)
+
+
+def _labelled(source: _Source, parts: Structure, z: Array) -> _Pool:
+    """The black box's labels at rows z."""
+    assert source.oracle is not None
+    chunks = ((r, *parts.residual(source.oracle, r)) for r in np.array_split(z, -(-len(z) * parts.cost // CHUNK)))
     return _collect(chunks, parts, source.gradients)
 
 
@@ -331,7 +386,8 @@ def _features(box: Box, group: Group, z: ca.SX, angles: bool) -> tuple[list[ca.S
     """(phi: sin and cos of angles and scaled others, the place in the group of the variable that each depends on)."""
     phi, owner = [], []
     for i, k in enumerate(group.variables):
-        new = [ca.sin(z[k]), ca.cos(z[k])] if angles and k in box.angles else [(z[k] - _centre(box)[k]) / _spread(box)[k]]
+        scaled = (z[k] - _centre(box)[k]) / _spread(box)[k]
+        new = [ca.sin(z[k]), ca.cos(z[k])] if angles and k in box.angles else [scaled]
         phi += new
         owner += [i] * len(new)
     return phi, owner
@@ -397,12 +453,6 @@ class _Draws:
         return copy
 
 
-def _width(group: Group, settings: Settings) -> int:
-    """Hidden units: more for functions of more variables."""
-    v = len(group.variables)
-    return settings.width or (24 if v <= 2 else 32 if v <= 4 else 48 if v <= 6 else 96)
-
-
 def _fit_groups(source: _Source, parts: Structure, settings: Settings, seed: int, bar: _Progress,
                 checkpoint: _Checkpoint) -> list[fit.Weights]:
     """The weights of each group's network, in the units of its entries."""
@@ -410,7 +460,7 @@ def _fit_groups(source: _Source, parts: Structure, settings: Settings, seed: int
         return []
     pool = _pool(source, parts, settings, np.random.default_rng((seed, 1)))
     weights = []
-    for i, group in enumerate(parts.groups):
+    for i in range(len(parts.groups)):
         done = checkpoint.get(i)
         weights.append(_fit_group(source.box, parts, pool, i, settings, seed, bar) if done is None else done)
         if done is None:
@@ -419,23 +469,72 @@ def _fit_groups(source: _Source, parts: Structure, settings: Settings, seed: int
 
 
 def _fit_group(box: Box, parts: Structure, pool: _Pool, index: int, settings: Settings, seed: int,
-               bar: _Progress) -> fit.Weights:
+               bar: _Progress, old: fit.Weights | None = None) -> fit.Weights:
+    """Train one network, from `old` weights without SOAP's large steps; its weights in the units of its labels."""
     group = parts.groups[index]
     samples, mean, spread = _samples(box, group, pool, index, settings.angles)
     generator = torch.Generator().manual_seed(seed * 1000 + index)
     draws = _Draws(samples, settings.gradient_weight, generator)
-    weights = fit.initial(samples.phi.shape[1], _width(group, settings), samples, generator)
-    polish = settings.polish if sum(w.numel() for w in weights) <= MAX_POLISHED else 0
+    budget = settings.budget(len(group.variables))
+    if old is None:
+        weights = fit.initial(samples.phi.shape[1], budget.width, samples, generator)
+    else:
+        weights = [old[0], old[1], _scaled(old, -mean / spread, 1 / spread)]
+    polish = budget.polish if sum(w.numel() for w in weights) <= MAX_POLISHED else 0
+    iterations = 0 if old is not None and polish else budget.iterations
     title = f"network {index + 1}/{len(parts.groups)}"
-    with bar.stage(f"{title}, SOAP", settings.iterations) as report:
-        weights = fit.soap(weights, draws.to(torch.float32), iterations=settings.iterations, batch=settings.batch,
-                           lr=settings.lr, report=report)
-    with bar.stage(f"{title}, Levenberg-Marquardt", polish) as report:
-        weights = fit.levenberg_marquardt(weights, draws, steps=polish, batch=settings.polish_batch, report=report)
-    W1, W2, W3 = weights
-    W3 = W3 * torch.from_numpy(spread)[:, None]
-    W3[:, W2.shape[0]] += torch.from_numpy(mean)
-    return [W1, W2, W3]
+    if iterations:
+        with bar.stage(f"{title}, SOAP", iterations) as report:
+            weights = fit.soap([w.float() for w in weights], draws.to(torch.float32), iterations=iterations,
+                               batch=budget.batch, lr=settings.lr if old is None else settings.lr / 4, report=report)
+    if polish:
+        with bar.stage(f"{title}, Levenberg-Marquardt", polish) as report:
+            weights = fit.levenberg_marquardt(weights, draws, steps=polish, batch=budget.polish_batch, report=report)
+    weights = [w.double() for w in weights]
+    return [*weights[:2], _scaled(weights, mean, spread)]
+
+
+def _scaled(weights: fit.Weights, shift: Array, scale: Array) -> Tensor:
+    """W3 of the network whose answers are shift + scale * those of this one."""
+    W3 = weights[2].double() * torch.from_numpy(scale)[:, None]
+    W3[:, weights[1].shape[0]] += torch.from_numpy(shift)
+    return W3
+
+
+def _refined(model: LearnedDynamics, states: ArrayLike, controls: ArrayLike, spread: float, share: float, seed: int,
+             settings: Settings, progress: bool) -> LearnedDynamics:
+    system, parts = model.system, model.parts
+    if parts is None or not parts.groups:
+        raise ValueError("refine: the model has no networks that could be trained; expected one of method 'default' or "
+                         "'mlp' that is not all in closed form")
+    if not (np.isfinite(spread) and spread > 0 and 0 < share <= 1):
+        raise ValueError(f"refine: spread is {spread}, share is {share}; expected spread > 0 and 0 < share <= 1")
+    near = np.hstack([checks.states(states, system.nx, system.name, "states")[0],
+                      checks.states(controls, system.nu, system.name, "controls")[0]])
+    rng, source, start = np.random.default_rng((seed, 2)), _Source.of(system, None, True), time.perf_counter()
+    n, box = _rows(parts, settings), parts.split.box
+    z = box.sample(n, rng)
+    tube = rng.random(n) < share
+    picked = near[rng.integers(len(near), size=int(tube.sum()))]
+    z[tube] = picked + spread * box.width * rng.standard_normal(picked.shape)
+    pool, bar = _labelled(source, parts, z), _Progress(system.name, progress)
+    old = [_weights(net) for net in model.net.nets if isinstance(net, MLP)]
+    angles = bool(model.card["settings"]["angles"])
+    settings = replace(settings, angles=angles)
+    weights = [_fit_group(box, parts, pool, i, settings, seed, bar, w) for i, w in enumerate(old)]
+    net = _assemble(parts, weights, angles)
+    card = {**model.card, "labels": model.card["labels"] + source.labels, "refined": model.card.get("refined", 0) + 1,
+            "seconds": round(model.card["seconds"] + time.perf_counter() - start, 3),
+            "score": str(_score(net, Dataset.sample(system, 2000, 1_000_003)))}
+    return LearnedDynamics(system, net, model.structure, card, parts)
+
+
+def _weights(mlp: MLP) -> fit.Weights:
+    """The three weight matrices of a network that `_mlp` made."""
+    s = mlp.state_dict()
+    return [torch.cat([s["body.0.weight"], s["body.0.bias"][:, None]], 1),
+            torch.cat([s["body.2.weight"], s["body.2.bias"][:, None]], 1),
+            torch.cat([s["body.4.weight"], s["body.4.bias"][:, None], s["skip.weight"]], 1)]
 
 
 def _mlp(weights: fit.Weights) -> MLP:
@@ -466,18 +565,23 @@ def _assemble(parts: Structure, weights: Sequence[fit.Weights], angles: bool) ->
 
 def _score(net: FeatureNet, data: Dataset) -> Score:
     """Errors of a network on exact labels."""
-    x, u = (torch.from_numpy(np.ascontiguousarray(a)).requires_grad_() for a in (data.x, data.u))
-    y = net(x, u)
-    error = np.linalg.norm(y.detach().numpy() - data.xdot, axis=1)
-    rows = []
-    for i in range(y.shape[1]):
-        grads = torch.autograd.grad(y[:, i].sum(), (x, u), retain_graph=True, allow_unused=True) if y.requires_grad else (None, None)
-        rows.append(torch.cat([torch.zeros_like(v) if g is None else g for g, v in zip(grads, (x, u), strict=True)], 1))
-    assert data.A is not None and data.B is not None
-    jacobian = np.stack([r.numpy() for r in rows], axis=1) - np.concatenate([data.A, data.B], axis=2)
+    x, u = (torch.from_numpy(np.ascontiguousarray(a)) for a in (data.x, data.u))
+    value, gradient = _value_and_jacobian(net, x, u)
+    error = np.linalg.norm(value - data.xdot, axis=1)
+    assert data.A is not None
+    assert data.B is not None
+    slope = gradient - np.concatenate([data.A, data.B], axis=2)
     q1, median, q3 = np.percentile(error, [25, 50, 75])
     return Score(float(error.mean()), float(error.std()), float(median), float(q3 - q1),
-                 float(np.linalg.norm(jacobian, axis=(1, 2)).mean()), len(error))
+                 float(np.linalg.norm(slope, axis=(1, 2)).mean()), len(error))
+
+
+def _value_and_jacobian(net: FeatureNet, x: Tensor, u: Tensor) -> tuple[Array, Array]:
+    """f_theta [N, nx] and its Jacobian [N, nx, nz] at rows, by reverse mode, an output at a time."""
+    z = torch.cat([x, u], 1).requires_grad_()
+    y = net(z[:, : x.shape[1]], z[:, x.shape[1]:])
+    rows = [torch.autograd.grad(y[:, i].sum() + 0 * z.sum(), z, retain_graph=True)[0] for i in range(y.shape[1])]
+    return y.detach().numpy(), torch.stack(rows, 1).numpy()
 
 
 def _paper(source: _Source, settings: PaperSettings, seed: int, bar: _Progress) -> FeatureNet:
@@ -576,8 +680,8 @@ class _Checkpoint:
             return None
         state, meta = store.load_checkpoint(self._path(index))
         if meta != self.meta:
-            raise ValueError(f"{self._path(index)} is of another system, seed or settings; expected the same call as the "
-                             "one that is resumed: use another checkpoint folder")
+            raise ValueError(f"{self._path(index)} is of another system, seed or settings; expected the same call as "
+                             "the one that is resumed: use another checkpoint folder")
         return list(state)
 
     def put(self, index: int, weights: fit.Weights) -> None:
