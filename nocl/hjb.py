@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nocl.integrate import rk4_cost
+from nocl.integrate import rk4, rk4_cost
 
 Map = Callable[..., Tensor]  # of one or two tensors of rows
 Step = Callable[..., tuple[Any, Any]]  # (f, L, x, u, h) -> (x after h with u held, integral of L)
@@ -27,11 +27,11 @@ SMOOTH = 1e-6  # sqrt(|g|^2 + SMOOTH^2) - SMOOTH stands for |g|: its gradient is
 
 @dataclass(frozen=True, eq=False)
 class Rollout:
-    """B trajectories under a policy that is held over each of K steps."""
+    """B trajectories under a policy, K steps long."""
 
     t: Tensor  # [K+1]
     x: Tensor  # [B, K+1, nx]
-    u: Tensor  # [B, K, nu], held over [t_k, t_{k+1})
+    u: Tensor  # [B, K, nu], at the first K nodes
     running: Tensor  # [B, 1], integral of L
 
 
@@ -58,21 +58,38 @@ def euler_cost(f: Map, L: Map, x: Any, u: Any, h: Any) -> tuple[Any, Any]:
 
 
 def rollout(policy: Map, dynamics: Map, L: Map, x0: Tensor, T: float, K: int, *, t0: float = 0.0,
-            step: Step = rk4_cost) -> Rollout:
-    """Trajectories from x0 [B, nx] over [t0, T] in K equal steps; the policy is asked at each node and held.
+            step: Step = rk4_cost, hold: bool = True) -> Rollout:
+    """Trajectories from x0 [B, nx] over [t0, T] in K equal steps.
 
+    With `hold` the policy is asked at each node and held over the step, which `step` makes. Without, it is feedback in
+    continuous time: it stands inside the ODE, which RK4 solves, and is asked at each of the four stages.
     Differentiable in whatever policy, dynamics, L and x0 depend on. More batch dimensions may stand in place of B.
     """
     h, x, column = (T - t0) / K, x0, (*x0.shape[:-1], 1)
     states, controls, running = [x0], [], x0.new_zeros(column)
     for k in range(K):
-        u = policy(x, x0.new_full(column, t0 + k * h))
-        x, cost = step(dynamics, L, x, u, h)
+        t = x0.new_full(column, t0 + k * h)
+        u = policy(x, t)
+        x, cost = step(dynamics, L, x, u, h) if hold else _feedback_step(policy, dynamics, L, x, u, t, h)
         running = running + cost
         states.append(x)
         controls.append(u)
-    t = torch.linspace(t0, T, K + 1, dtype=x0.dtype, device=x0.device)
-    return Rollout(t, torch.stack(states, -2), torch.stack(controls, -2), running)
+    nodes = torch.linspace(t0, T, K + 1, dtype=x0.dtype, device=x0.device)
+    return Rollout(nodes, torch.stack(states, -2), torch.stack(controls, -2), running)
+
+
+def _feedback_step(policy: Map, dynamics: Map, L: Map, x: Tensor, u: Tensor, t: Tensor, h: float,
+                   ) -> tuple[Tensor, Tensor]:
+    """RK4 on z = (x, t, integral of L) with u = policy(x, t) inside; u is its known answer at the first stage."""
+    first = [u]
+
+    def field(z: Tensor, _: None) -> Tensor:
+        x, t = z[..., :-2], z[..., -2:-1]
+        u = first.pop() if first else policy(x, t)
+        return torch.cat([dynamics(x, u), torch.ones_like(t), L(x, u)], -1)
+
+    z = rk4(field, torch.cat([x, t, torch.zeros_like(t)], -1), None, h)
+    return z[..., :-2], z[..., -1:]
 
 
 def hamiltonian(dynamics: Map, L: Map, x: Tensor, u: Tensor, costate: Tensor) -> Tensor:
@@ -131,14 +148,14 @@ def smooth_norm(g: Tensor) -> Tensor:
 
 
 def losses(policy: Map, value: Map, dynamics: Map, L: Map, G: Map, x0: Tensor, T: float, K: int, *, t0: float = 0.0,
-           step: Step = rk4_cost, detach: bool = False) -> Losses:
-    """The losses of CND on trajectories from x0 [B, nx], by the policy held over K steps of [t0, T].
+           step: Step = rk4_cost, hold: bool = True, detach: bool = False) -> Losses:
+    """The losses of CND on trajectories from x0 [B, nx] over [t0, T] in K steps; step, hold: see `rollout`.
 
-    The HJB residual and dH/du are taken at the first K nodes, with the u that is held from there. As in the paper
+    The HJB residual and dH/du are taken at the first K nodes, with the policy's u there. As in the paper
     everything is trained through everything. With `detach` the states of the trajectory are constants in all but
     L_cost: V is fitted where the policy goes, and the policy does not change its course to make V's fit look better.
     """
-    path = rollout(policy, dynamics, L, x0, T, K, t0=t0, step=step)
+    path = rollout(policy, dynamics, L, x0, T, K, t0=t0, step=step, hold=hold)
     return path_losses(path, policy, value, dynamics, L, G, detach=detach)
 
 

@@ -177,15 +177,32 @@ def test_the_rollout_integrates_to_the_order_of_its_step():
     assert errors[hjb.euler_cost, 20] / errors[hjb.euler_cost, 40] == pytest.approx(2, rel=0.1)
 
 
+def test_feedback_inside_the_ode_is_the_continuous_closed_loop():
+    def closed_loop(t, z):
+        u = np.tanh(z[0] - z[1] + t)
+        return [z[1] * u, np.sin(z[0]) + u**2, 0.5 * u**2 + z[0]]
+
+    x0 = np.array([[0.3, -0.4], [-0.2, 0.1]])
+    exact = np.stack([solve_ivp(closed_loop, (0.5, T), [*x, 0.0], rtol=1e-12, atol=1e-13).y[:, -1] for x in x0])
+    errors = []
+    for K in (20, 40):
+        path = hjb.rollout(any_policy, any_f, any_L, tensor(x0), T, K, t0=0.5, hold=False)
+        errors.append(np.abs(torch.cat([path.x[:, -1], path.running], 1).numpy() - exact).max())
+        np.testing.assert_allclose(path.u[:, 0], any_policy(tensor(x0), 0.5))
+        np.testing.assert_allclose(path.u[:, -1], any_policy(path.x[:, -2], float(path.t[-2])))
+    assert errors[1] < 1e-6
+    assert errors[0] / errors[1] == pytest.approx(16, rel=0.3)
+
+
 def networks(dtype=torch.float64, nx=4):
     torch.manual_seed(0)
     u, V = MLP((nx + 1, 8, 8, 1)).to(dtype), MLP((nx + 1, 8, 8, 1), skip=True).to(dtype)
     return u, V, (lambda x, t: 3 * torch.tanh(u(torch.cat([x, t], 1)))), (lambda x, t: V(torch.cat([x, t], 1)))
 
 
-@pytest.mark.parametrize("detach", [False, True])
+@pytest.mark.parametrize(("detach", "hold"), [(False, True), (True, True), (False, False)])
 @pytest.mark.parametrize("which", ["cost", "hjb", "final", "hamil"])
-def test_gradients_of_the_losses_are_finite_differences(which, detach):
+def test_gradients_of_the_losses_are_finite_differences(which, detach, hold):
     ocp = cartpole.ocp()
     f, L, G = map(to_torch, (ocp.system.f, ocp.L, ocp.G))
     u, V, policy, value = networks()
@@ -196,11 +213,11 @@ def test_gradients_of_the_losses_are_finite_differences(which, detach):
     def loss():
         if detach and which != "cost":  # the states held at where they are
             return getattr(hjb.path_losses(frozen, policy, value, f, L, G, detach=True), which)
-        return getattr(hjb.losses(policy, value, f, L, G, x0, 1.0, 10, detach=detach), which)
+        return getattr(hjb.losses(policy, value, f, L, G, x0, 1.0, 10, detach=detach, hold=hold), which)
 
     parameters = [*u.parameters(), *V.parameters()]
-    gradients = torch.autograd.grad(getattr(hjb.losses(policy, value, f, L, G, x0, 1.0, 10, detach=detach), which),
-                                    parameters, materialize_grads=True)
+    terms = hjb.losses(policy, value, f, L, G, x0, 1.0, 10, detach=detach, hold=hold)
+    gradients = torch.autograd.grad(getattr(terms, which), parameters, materialize_grads=True)
     rng, h = np.random.default_rng(1), 1e-6
     for _ in range(3):
         direction = [tensor(rng.standard_normal(tuple(p.shape))) for p in parameters]

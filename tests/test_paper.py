@@ -29,7 +29,7 @@ TINY = {"iterations": 4, "batch": 4, "race": 2, "race_iterations": 2, "race_batc
     ({"learning_rate": 0.0}, "learning_rate"), ({"learning_rate": None}, "learning_rate"), ({"decay": 2.0}, "decay"),
     ({"decay": math.nan}, "decay"), ({"clip": -1.0}, "clip"), ({"clip": "no"}, "clip"),
     ({"weights": (1, 1)}, "weights"), ({"weights": (1, -1, 0, 0)}, "weights"), ({"weights": (0, 1, 0, 0)}, "weights"),
-    ({"weights": 1.0}, "weights")])
+    ({"weights": 1.0}, "weights"), ({"step": "euler", "hold": False}, "step")])
 def test_settings_say_what_is_wrong(wrong, named):
     with pytest.raises(ValueError, match=rf"PaperSettings: {named} is .*expected"):
         PaperSettings(**wrong)
@@ -151,6 +151,16 @@ def test_double_integrator_reaches_the_cost_of_lqr():
     assert run.success.all()
     assert (run.cost >= best * (1 - 1e-6)).all()
     assert run.cost.mean() < 1.2 * best.mean()
+
+
+@pytest.mark.parametrize("settings", [{"hold": False}, {"step": "euler"}, {"detach": True}, {"clip": None, "race": 1}])
+def test_each_option_trains(settings):
+    ocp = double_integrator.ocp()
+    *nets, card = train(ocp, **{**TINY, "iterations": 60, "intervals": 10, **settings})
+    first, last = np.reshape(card["history"]["cost"], (2, -1)).mean(1)
+    assert last < first
+    different = train(ocp, **{**TINY, "iterations": 60, "intervals": 10})[:2]
+    assert not torch.equal(outputs(nets, ocp)[1], outputs(different, ocp)[1])
 
 
 def test_a_system_of_ones_own_goes_through():

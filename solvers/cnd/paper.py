@@ -54,6 +54,7 @@ class PaperSettings:
     sin_cos: bool = True  # sin and cos of declared angles as inputs, beside their values
     intervals: int = 50  # K: steps of a rollout, controls held over each
     step: str = "rk4"  # or "euler", as published
+    hold: bool = True  # controls held over each interval; False: feedback in continuous time, inside RK4's stages
     fused: bool = True  # RK4 steps of the exact f as compiled C on the CPU; False: in torch, with the same gradients
     iterations: int = 1500  # of Adam, after the race
     batch: int = 128  # initial states an iteration
@@ -76,6 +77,9 @@ class PaperSettings:
             if not _is_count(getattr(self, name)):
                 raise ValueError(f"PaperSettings: {name} is {getattr(self, name)!r}; expected an integer >= 1")
         self._check_numbers()
+        if not self.hold and self.step != "rk4":
+            raise ValueError(f"PaperSettings: step is {self.step!r} with hold=False; expected step='rk4', which "
+                             "feedback in continuous time is integrated by")
         for name, known in (("activation", ACTIVATIONS), ("step", STEPS)):
             if getattr(self, name) not in known:
                 raise ValueError(f"PaperSettings: {name} is {getattr(self, name)!r}; expected {', '.join(known)}")
@@ -181,14 +185,14 @@ class _Trainer:
         x0 = self.ocp.initial_states.sample(math.prod(batch), self.rng).reshape(*batch, -1)
         return torch.as_tensor(x0, dtype=self.dtype, device=self.device)
 
-    def rollout(self, policy: hjb.Map, x0: Tensor) -> hjb.Rollout:
+    def rollout(self, policy: hjb.Map, x0: Tensor, hold: bool) -> hjb.Rollout:
         K = self.settings.intervals
         self.evaluations += math.prod(x0.shape[:-1]) * K * (1 if self.settings.step == "euler" else 4)
-        return hjb.rollout(policy, self.f, self.L, x0, self.ocp.horizon, K, step=self.step)
+        return hjb.rollout(policy, self.f, self.L, x0, self.ocp.horizon, K, step=self.step, hold=hold)
 
-    def costs(self, policy: hjb.Map, x0: Tensor) -> Tensor:
+    def costs(self, policy: hjb.Map, x0: Tensor, hold: bool) -> Tensor:
         """The cost of each trajectory."""
-        path = self.rollout(policy, x0)
+        path = self.rollout(policy, x0, hold)
         return (path.running + self.G(path.x[..., -1, :]))[..., 0]
 
     def race(self) -> tuple[FeatureNet, list[float]]:
@@ -200,7 +204,7 @@ class _Trainer:
         adam = torch.optim.Adam(parameters.values(), lr=s.learning_rate)
         recent: list[Tensor] = []
         for _ in (bar := tqdm(range(s.race_iterations), f"{s.race} random controllers", disable=not self.progress)):
-            J = self.costs(policy, self.states(s.race, s.race_batch)).mean(1)
+            J = self.costs(policy, self.states(s.race, s.race_batch), hold=True).mean(1)
             gradients = torch.autograd.grad(J.sum(), list(parameters.values()))
             _step(adam, list(parameters.values()), _clip_each(gradients, s.clip))
             recent = [*recent, J.detach()][-LAST:]
@@ -238,7 +242,7 @@ class _Trainer:
                 callback(k, named)
             if (k + 1) % every == 0 or k + 1 == s.iterations:
                 with torch.no_grad():
-                    best.offer(float(self.costs(policy, held_out).mean()), k + 1, policy, value)
+                    best.offer(float(self.costs(policy, held_out, s.hold).mean()), k + 1, policy, value)
         history = {"history": {name: [row[i] for row in rows] for i, name in enumerate(TERMS)},
                    "best_iteration": best.iteration, "held_out_cost": best.cost}
         return *best.networks(s), history
@@ -246,7 +250,7 @@ class _Trainer:
     def losses(self, policy: FeatureNet, value: FeatureNet) -> hjb.Losses:
         """The four terms on fresh trajectories; those of weight 0 are not computed."""
         s = self.settings
-        path = self.rollout(policy, self.states(s.batch))
+        path = self.rollout(policy, self.states(s.batch), s.hold)
         if not any(s.weights[1:]):
             cost = (path.running + self.G(path.x[:, -1])).mean()
             return hjb.Losses(cost, *[torch.zeros_like(cost)] * 3)
