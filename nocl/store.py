@@ -124,8 +124,13 @@ def read_json(path: str | Path) -> Any:
 
 def write_text(path: str | Path, text: str) -> Path:
     """Write a text file atomically."""
+    return write_bytes(path, text.encode())
+
+
+def write_bytes(path: str | Path, content: bytes) -> Path:
+    """Write a file atomically."""
     path = Path(path)
-    _replace(path, text.encode())
+    _replace(path, content)
     return path
 
 
