@@ -208,8 +208,8 @@ def identify(system: System, *, data: Dataset | None = None, method: str = "defa
     Parameters
     ----------
     system : System
-        Answers for labels at uniform samples of its box; its equations are never read. With `data`, it gives names,
-        boxes and angles only.
+        Answers for labels at samples of its box; its equations are never read. With `data`, training takes names, boxes
+        and angles from it only; the score on the card always compares with its f.
     data : Dataset
         Labels to learn from instead; without Jacobians A, B, from values alone.
     method : "default", "mlp" or "paper"
@@ -217,7 +217,7 @@ def identify(system: System, *, data: Dataset | None = None, method: str = "defa
     settings : Settings or (method "paper") PaperSettings
         Budgets and sizes.
     checkpoint : folder
-        Finished networks are kept there, and not trained again when the same call is repeated.
+        Finished networks are kept there, and not trained again when the same call is repeated ("paper": unused).
 
     Raises
     ------
