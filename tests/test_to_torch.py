@@ -14,10 +14,16 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.func import jacrev, vmap
 
+from nocl.checks import COPYSIGN_WRONG
 from nocl.symbolic import BINARY, UNARY, instructions
 from nocl.to_torch import BOOLEAN, COPIES, FLOAT_OPS, to_torch
 
 F64 = torch.float64
+
+
+def skip_what_casadi_gets_wrong(name: str) -> None:
+    if COPYSIGN_WRONG and "copysign" in name.lower():
+        pytest.skip("this CasADi differentiates copysign wrongly; System and OCP refuse it")
 
 
 def unary(op: str, x: ca.SX) -> ca.SX:
@@ -58,6 +64,7 @@ def test_every_scalar_operation_of_casadi_is_known() -> None:
 
 @pytest.mark.parametrize("op", TRANSLATED)
 def test_operation(op: str) -> None:
+    skip_what_casadi_gets_wrong(op)
     z = ca.SX.sym("z", 2)
     points = np.random.default_rng(0).uniform(*DOMAIN.get(op, (-2, 2)), (40, 2))
     plain = unary(op, z[0]) if op in UNARY else binary(op, z[0], z[1])
@@ -69,6 +76,7 @@ def test_operation(op: str) -> None:
 @pytest.mark.parametrize("op", sorted(BINARY - {"OP_PRINTME"}))
 @pytest.mark.parametrize("constant", [0.7, 2.0, 3.0])
 def test_operation_with_a_constant(op: str, constant: float) -> None:
+    skip_what_casadi_gets_wrong(op)
     x = ca.SX.sym("x")
     points = np.random.default_rng(1).uniform(*DOMAIN.get(op, (-2, 2)), (20, 1))
     same_as_casadi(ca.vertcat(binary(op, x, ca.SX(constant)), binary(op, ca.SX(constant), x)) * ca.cos(x), x, points)
@@ -89,6 +97,7 @@ KINKS = {
 
 @pytest.mark.parametrize("name", KINKS)
 def test_kinks(name: str) -> None:
+    skip_what_casadi_gets_wrong(name)
     grid = np.array([-3.0, -2.0, -1.0, -0.5, 0.0, 0.1, 0.5, 1.0, 2.0, 3.0, 5.0])
     points = np.stack(np.meshgrid(grid, grid), -1).reshape(-1, 2)
     same_as_casadi(KINKS[name], ca.vertcat(X, Y), points)
@@ -315,7 +324,8 @@ def test_arguments_that_do_not_fit(args: tuple[Tensor, ...], message: str) -> No
 def test_instruction_of_a_unary_operation_reads_one_operand() -> None:
     for op in UNARY - COPIES:
         steps = list(instructions(ca.Function("f", [X], [unary(op, X)])))
-        assert [len(s.args) for s in steps if s.op == op] == [1]
+        found = [len(s.args) for s in steps if s.op == op]
+        assert found == [1] or (op == "OP_TWICE" and not found)  # CasADi 3.7 writes 2 x
 
 
 @pytest.mark.slow
