@@ -15,8 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import nocl
-from nocl import checks
-from nocl import pretty
+from nocl import checks, pretty
 from nocl.systems import NAMES
 
 
@@ -267,5 +266,5 @@ def test_notation(expression, text):
 def test_copysign_is_refused_where_casadi_differentiates_it_wrongly(monkeypatch):
     x, u = ca.SX.sym("x"), ca.SX.sym("u")
     monkeypatch.setattr(checks, "COPYSIGN_WRONG", True)
-    with pytest.raises(ValueError, match="xdot contains copysign, which CasADi .* differentiates wrongly"):
+    with pytest.raises(ValueError, match=r"xdot contains copysign, which CasADi .* differentiates wrongly"):
         nocl.System("s", x=x, u=u, xdot=ca.copysign(x, u), lbu=[-1], ubu=[1], lbx=[-1], ubx=[1])
