@@ -1,0 +1,118 @@
+"""Trained controllers as feedback: the gap to the optimum in continuous time, on hidden states, and under kicks.
+
+    python benchmarks/controllers.py [PROBLEM ...] [--dynamics exact learned] [--seeds 0 1 2] [--n 200]
+
+Every controller is judged by CVODES on the exact f, as continuous feedback, from initial states that training did not
+see. J* is the continuous-time optimum: the best of DDP's cold starts, neighbours and the controller's own rollout, with
+640 held controls. Under kicks (5 of N(0, sigma^2) on every state, at random times) the reference is the optimum
+solved anew after each kick.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parent))
+import provenance
+
+import nocl
+from nocl.checks import Array
+from nocl.nets import FeatureNet
+from nocl.ocp import OCP
+from nocl.simulate import simulate
+from nocl.solvers.bank import better, solve_globally
+from nocl.solvers.cnd.labels import policy_controls
+from nocl.solvers.ddp import DDP, DDPSolution
+
+FINE = 640  # intervals of the reference
+SLOTS = 40  # kicks fall on multiples of the horizon over SLOTS
+
+
+def optimum(ocp: OCP, x0: Array, policy: FeatureNet) -> DDPSolution:
+    """The best solutions known from x0, on FINE intervals."""
+    coarse, fine = DDP(ocp), DDP(ocp, intervals=FINE)
+    found = solve_globally(coarse, x0, starts=8, seed=99).best
+    own = policy_controls(policy, nocl.to_torch(ocp.system.f), x0, np.zeros(len(x0)), ocp.horizon, FINE)
+    return better(fine.solve(x0, u=np.repeat(found.u, FINE // coarse.intervals, axis=1)), fine.solve(x0, u=own))
+
+
+def kicked_optimum(ocp: OCP, start: DDPSolution, kicks: list[tuple[int, Array]]) -> Array:
+    """Cost [B] of the optimum that is solved anew after each kick (slot, dx), from the unkicked optimum."""
+    solution, cost, now = start, np.zeros(len(start)), 0
+    per_slot = FINE // SLOTS
+    for slot, dx in kicks:
+        node = (slot - now) * per_slot
+        cost += solution.V[:, 0] - solution.V[:, node]
+        x, u = solution.x[:, node] + dx, np.ascontiguousarray(solution.u[:, node:])
+        ddp = DDP(ocp, intervals=FINE - slot * per_slot)
+        states, gain = np.ascontiguousarray(solution.x[:, node:]), np.ascontiguousarray(solution.gain[:, node:])
+        t0 = slot * ocp.horizon / SLOTS
+        solution, now = better(ddp.solve(x, t0, u=u, x=states, gain=gain), ddp.solve(x, t0, u=u)), slot
+    return cost + solution.cost
+
+
+def quantiles(gap: Array) -> dict[str, float]:
+    return {"median_%": round(100 * float(np.median(gap)), 4), "p95_%": round(100 * float(np.quantile(gap, 0.95)), 4),
+            "max_%": round(100 * float(gap.max()), 3)}
+
+
+def score(ocp: OCP, cnd: nocl.CND, n: int, sigma: float, seed: int = 12345) -> dict[str, Any]:
+    """The row of one controller."""
+    rng = np.random.default_rng(seed)
+    x0 = ocp.initial_states.sample(n, rng)
+    best = optimum(ocp, x0, cnd.policy)
+    run = simulate(ocp, cnd, x0)
+    gap = run.cost / best.cost - 1
+    row = {"failed": int((~run.success).sum() + (~best.success).sum()), "J*": round(float(best.cost.mean()), 5),
+           "gap": quantiles(gap), "terminal_error": round(float(run.terminal_error.mean()), 4),
+           "control": round(float(run.control_magnitude.mean()), 3), "collisions": int((run.clearance < 0).sum()),
+           "worst_x0": [[round(v, 4) for v in x0[i].tolist()] for i in np.argsort(-gap)[:3]]}
+    slots = np.sort(rng.choice(np.arange(1, SLOTS - 1), 5, replace=False))
+    pushes = [(int(s), sigma * rng.standard_normal(x0.shape)) for s in slots]
+    kicked = simulate(ocp, cnd, x0, kicks=[(s * ocp.horizon / SLOTS, dx) for s, dx in pushes])
+    row["kicked_gap"] = quantiles(kicked.cost / kicked_optimum(ocp, best, pushes) - 1)
+    V = cnd.value(x0, 0.0)
+    row["value_error_%"] = round(100 * float(np.mean(np.abs(V / best.cost - 1))), 3)
+    cosine = _cosine(cnd.value_gradient(x0, 0.0), best.V_x[:, 0])
+    row["value_gradient_degrees"] = round(float(np.degrees(np.median(np.arccos(np.clip(cosine, -1, 1))))), 2)
+    return row
+
+
+def _cosine(a: Array, b: Array) -> Array:
+    return (a * b).sum(1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("problems", nargs="*", default=["cartpole", "acrobot", "quadrotor", "dubins", "pendulum"])
+    parser.add_argument("--dynamics", nargs="+", default=["exact", "learned"], choices=["exact", "learned"])
+    parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
+    parser.add_argument("--n", type=int, default=200)
+    parser.add_argument("--sigma", type=float, default=0.05)
+    parser.add_argument("--keep", type=Path, help="save the controllers of the first seed in this folder")
+    options, rows = parser.parse_args(), []
+    for problem in options.problems:
+        ocp = nocl.load_ocp(problem)
+        for dynamics in options.dynamics:
+            for seed in options.seeds:
+                model = nocl.identify(ocp.system, seed=seed) if dynamics == "learned" else None
+                start = time.perf_counter()
+                cnd = nocl.train(ocp, model, seed=seed)
+                seconds = round(time.perf_counter() - start, 1)
+                rows.append({"problem": problem, "dynamics": dynamics, "seed": seed, "train_seconds": seconds,
+                             **score(ocp, cnd, options.n, options.sigma)})
+                print(rows[-1], flush=True)
+                provenance.write("controllers", rows, n=options.n, sigma=options.sigma)
+                if options.keep and seed == options.seeds[0]:
+                    cnd.card["score"] = rows[-1]
+                    cnd.save(options.keep / f"{problem}-{dynamics}")
+
+
+if __name__ == "__main__":
+    main()
