@@ -6,6 +6,7 @@ import ctypes
 import hashlib
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import tempfile
@@ -55,12 +56,18 @@ def emit(name: str, inputs: Sequence[ca.SX], outputs: Sequence[ca.SX]) -> str:
         if step.op == "OP_INPUT":
             right = f"i{step.args[0]}[{step.args[1]}]"
         elif step.op == "OP_CONST":
-            right = f"splat({float(step.value)!r})"
+            right = f"splat({_constant(step.value)})"
         else:
             right = _operation(step.op, [current[a] for a in step.args], name)
         lines.append(f"    const lane t{number} = {right};")
         current[step.out[0]] = f"t{number}"
-    return "\n".join([*lines, "}", ""]).replace("splat(inf)", "splat(INFINITY)").replace("splat(nan)", "splat(NAN)")
+    return "\n".join([*lines, "}", ""])
+
+
+def _constant(value: float) -> str:
+    if np.isfinite(value):
+        return repr(float(value))
+    return "NAN" if np.isnan(value) else "INFINITY" if value > 0 else "-INFINITY"
 
 
 def _operation(op: str, args: list[str], function: str) -> str:
@@ -110,14 +117,20 @@ def _c(value: object) -> Any:
     return ctypes.c_int64(int(value))  # type: ignore[call-overload]
 
 
-@lru_cache
-def _compiler() -> tuple[str, str]:
-    """(path, version) of the C compiler: $CC, gcc or cc; ValueError where there is none."""
-    for name in (os.environ.get("CC"), "gcc", "cc"):
-        path = shutil.which(name) if name else None
+def _compiler() -> list[str]:
+    """The command of the C compiler: $CC, or else gcc or cc; ValueError where there is none."""
+    named = shlex.split(os.environ.get("CC", ""))
+    for command in [named] if named else [["gcc"], ["cc"]]:
+        path = shutil.which(command[0])
         if path:
-            return path, subprocess.run([path, "--version"], capture_output=True, text=True, check=False).stdout
-    raise ValueError("no C compiler found (looked for $CC, gcc, cc): install gcc, or name one in CC")
+            return [path, *command[1:]]
+    looked = f"CC={named[0]}" if named else "gcc, cc"
+    raise ValueError(f"no C compiler found (looked for {looked}), and kernels are C: install gcc, or name one in CC")
+
+
+@lru_cache
+def _version(path: str) -> str:
+    return subprocess.run([path, "--version"], capture_output=True, text=True, check=False).stdout
 
 
 @lru_cache
@@ -137,11 +150,12 @@ def _machine() -> str:
 
 def _build(source: str, cache: str | os.PathLike[str] | None) -> Path:
     """The compiled library of this source, from the cache folder where it is there; two builders do not collide."""
-    compiler, version = _compiler()
+    compiler = _compiler()
     folder = Path(cache or os.environ.get(CACHE_VARIABLE) or _own_folder().name)
     folder.mkdir(parents=True, exist_ok=True)
     headers = [p.read_text() for p in sorted(HEADERS.glob("*.h"))]
-    key = hashlib.sha256("\0".join([source, *headers, version, _machine(), *FLAGS]).encode()).hexdigest()[:32]
+    identity = [source, *headers, *compiler, _version(compiler[0]), _machine(), *FLAGS]
+    key = hashlib.sha256("\0".join(identity).encode()).hexdigest()[:32]
     target = folder / f"{key}.so"
     if target.exists():
         return target
@@ -149,9 +163,9 @@ def _build(source: str, cache: str | os.PathLike[str] | None) -> Path:
         code, library = Path(scratch, "kernel.c"), Path(scratch, "kernel.so")
         code.write_text(source)
         for extra in (["-DWITH_MVEC", "-lmvec"], []):  # not every C library has vector mathematics
-            command = [compiler, *FLAGS, f"-I{HEADERS}", str(code), "-o", str(library), *extra, "-lm", "-Wl,-z,defs"]
+            command = [*compiler, *FLAGS, f"-I{HEADERS}", str(code), "-o", str(library), *extra, "-lm", "-Wl,-z,defs"]
             result = subprocess.run(command, capture_output=True, text=True, check=False)
             if result.returncode == 0:
                 os.replace(library, target)
                 return target
-    raise RuntimeError(f"{compiler} could not compile a kernel of nocl's:\n{result.stderr[-2000:]}")
+    raise RuntimeError(f"{compiler[0]} could not compile a kernel of nocl's:\n{result.stderr[-2000:]}")

@@ -40,6 +40,15 @@ class DDPSettings:
     damping: float = 1e-4  # first mu added to Quu where a sweep or a line search fails
     largest_damping: float = 1e8  # give up above it
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.max_iterations, int) or self.max_iterations < 1:
+            raise ValueError(f"DDPSettings: max_iterations is {self.max_iterations!r}; expected an integer >= 1")
+        for name in ("tolerance", "smallest_step", "damping", "largest_damping"):
+            checks.number(getattr(self, name), name, "DDPSettings", positive=True)
+        if self.smallest_step > 1 or self.damping > self.largest_damping:
+            raise ValueError(f"DDPSettings: smallest_step is {self.smallest_step}, damping {self.damping}, "
+                             f"largest_damping {self.largest_damping}; expected smallest_step <= 1 and damping below")
+
 
 @dataclass(frozen=True, eq=False)
 class DDPSolution:
@@ -93,11 +102,12 @@ class DDP:
     def __init__(self, ocp: OCP, *, intervals: int = 80, dynamics: LearnedDynamics | None = None,
                  settings: DDPSettings | None = None, threads: int | None = None,
                  cache: str | os.PathLike[str] | None = None) -> None:
-        if intervals < 1:
-            raise ValueError(f"DDP: intervals is {intervals}; expected at least 1")
+        for name, value in (("intervals", intervals), ("threads", 1 if threads is None else threads)):
+            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+                raise ValueError(f"DDP: {name} is {value!r}; expected an integer >= 1")
         self.ocp, self.intervals, self.settings = ocp, int(intervals), settings or DDPSettings()
         self.threads = threads or os.cpu_count() or 1
-        net = None if dynamics is None else dynamics.net
+        net = None if dynamics is None else _fitting(ocp, dynamics)
         self._weights = np.zeros(1) if net is None else pack_weights(net)
         self._kernel = Kernel(ddp_source(ocp, net), cache)
         self._lb, self._ub = np.ascontiguousarray(ocp.system.lbu), np.ascontiguousarray(ocp.system.ubu)
@@ -111,14 +121,21 @@ class DDP:
         x0 : [nx] or [B, nx]
         t0 : number or [B], each < horizon
         curvature : whether to return V_xx
+
+        Raises ValueError before any work for wrong shapes, x0 that is not finite and t0 outside [0, horizon). A problem
+        whose guess blows up, or that finds no minimum, has success False, cost inf and a message; the others go on.
         """
-        x0, _ = checks.states(x0, self.ocp.system.nx, self.ocp.system.name)
+        rows, _ = checks.states(x0, self.ocp.system.nx, self.ocp.system.name)
+        x0 = np.ascontiguousarray(rows)
         work = _Work(self, x0, self._start_times(t0, len(x0)), u, x, gain)
         work.descend()
         return work.solution(curvature)
 
     def _start_times(self, t0: ArrayLike, B: int) -> Array:
-        times = np.broadcast_to(np.asarray(t0, dtype=np.float64), (B,)).copy()
+        given = np.asarray(t0, dtype=np.float64)
+        if given.shape not in ((), (1,), (B,)):
+            raise ValueError(f"t0 has shape {given.shape}; expected a number, or one for each of the {B} states")
+        times = np.broadcast_to(given, (B,)).copy()
         bad = np.flatnonzero(~((times >= 0) & (times < self.ocp.horizon)))
         if bad.size:
             raise ValueError(f"t0[{bad[0]}] is {times[bad[0]]}; expected 0 <= t0 < horizon = {self.ocp.horizon}")
@@ -147,6 +164,7 @@ class _Work:
         self.slope, self.curve, self.positive = np.zeros(B), np.zeros(B), np.zeros(B)
         self.mu, self.alpha, self.iterations = np.zeros(B), np.zeros(B), np.zeros(B, dtype=np.int64)
         self.state = np.zeros(B, dtype=np.int64)  # an index of MESSAGES
+        self.refused = np.full(B, -1.0)  # the largest mu at which the last sweep's trajectory was not convex
         u = _guess(self.guess_u, (B, K, nu), "u", np.broadcast_to(ocp.u_goal, (B, K, nu)))
         x = _guess(self.guess_x, (B, K + 1, nx), "x", self.x)
         gain = _guess(self.guess_gain, (B, K, nu, nx), "gain", self.gain)
@@ -169,15 +187,35 @@ class _Work:
         s = self.ddp.settings
         while (rows := np.flatnonzero(self.state == RUNNING)).size:
             self.state[rows[self.iterations[rows] >= s.max_iterations]] = OUT_OF_ITERATIONS
-            self.iterations[rows] += 1
             rows = rows[self.state[rows] == RUNNING]
+            self.iterations[rows] += 1
             self._backward(rows)
-            good = rows[self.positive[rows] > 0]
-            self._damp(rows[self.positive[rows] == 0])
+            good, bad = rows[self.positive[rows] > 0], rows[self.positive[rows] == 0]
+            self.refused[bad] = np.maximum(self.refused[bad], self.mu[bad])
+            self._damp(bad)
             small = -(self.slope[good] + self.curve[good]) <= s.tolerance * np.abs(self.J[good]) + 1e-15
-            self.state[good[small & (self.mu[good] == 0)]] = CONVERGED
-            self._relax(good[small])
+            self._settle(good[small])
             self._line_search(good[~small])
+
+    def _settle(self, rows: Rows) -> None:
+        """Problems that predict no decrease: done without damping, else tried again with less of it."""
+        done = rows[self.mu[rows] == 0]
+        self.state[done] = CONVERGED
+        self._last_step(done)
+        damped = rows[self.mu[rows] > 0]
+        self._relax(damped)
+        self.state[damped[self.mu[damped] <= self.refused[damped]]] = NOT_CONVEX
+
+    def _last_step(self, rows: Rows) -> None:
+        """One more full Newton step where J does not rise: what is left of u's error is squared."""
+        self.alpha[rows] = 1.0
+        self._rollout(rows, self.x, self.u, self.gain)
+        won = rows[self.new_J[rows] <= self.J[rows]]
+        self._take(won)
+
+    def _take(self, rows: Rows) -> None:
+        self.x[rows], self.u[rows], self.J[rows] = self.new_x[rows], self.new_u[rows], self.new_J[rows]
+        self.refused[rows] = -1.0
 
     def _line_search(self, rows: Rows) -> None:
         """Halve each problem's step until J falls by a share of what was predicted; damp those that never do."""
@@ -188,7 +226,7 @@ class _Work:
             predicted = a * self.slope[rows] + a * a * self.curve[rows]
             done = self.new_J[rows] - self.J[rows] <= 1e-3 * np.minimum(predicted, 0.0)  # False for NaN
             won = rows[done]
-            self.x[won], self.u[won], self.J[won] = self.new_x[won], self.new_u[won], self.new_J[won]
+            self._take(won)
             self._relax(won[self.alpha[won] > 0.2])
             rows = rows[~done]
             self.alpha[rows] /= 2
@@ -219,8 +257,20 @@ class _Work:
 
 
 MESSAGES = ("running", "converged", "stopped at max_iterations", "no descent: the largest damping did not help",
-            "the starting guess blows up: its cost is not finite")
-RUNNING, CONVERGED, OUT_OF_ITERATIONS, NO_DESCENT, BLEW_UP = range(5)
+            "the starting guess blows up: its cost is not finite",
+            "stationary, but no minimum: the cost is not convex in the controls there")
+RUNNING, CONVERGED, OUT_OF_ITERATIONS, NO_DESCENT, BLEW_UP, NOT_CONVEX = range(6)
+
+
+def _fitting(ocp: OCP, dynamics: LearnedDynamics) -> Any:
+    """The networks of f_theta, if its states and controls are the problem's."""
+    if not hasattr(dynamics, "net"):
+        raise ValueError(f"DDP: dynamics is a {type(dynamics).__name__}; expected LearnedDynamics, as "
+                         "nocl.identify gives it, or None for the exact f")
+    ours, theirs = ocp.system.names, dynamics.system.names
+    if ours != theirs:
+        raise ValueError(f"DDP: dynamics was learned for {', '.join(theirs)}; the problem has {', '.join(ours)}")
+    return dynamics.net
 
 
 def _guess(value: Array | None, shape: tuple[int, ...], name: str, default: Array) -> Array:
@@ -228,5 +278,5 @@ def _guess(value: Array | None, shape: tuple[int, ...], name: str, default: Arra
         return np.ascontiguousarray(default, dtype=np.float64)
     array = np.ascontiguousarray(value, dtype=np.float64)
     if array.shape != shape:
-        raise ValueError(f"DDP: the guess {name} has shape {array.shape}, expected {shape}")
+        raise ValueError(f"DDP: the guess {name} has shape {array.shape}; expected {shape}, a row for each x0")
     return array

@@ -75,7 +75,7 @@ static mask factor(lane Q[M][M], const mask *held, lane L[M][M])
             lane sum = where(held[i] | held[j], splat(i == j), Q[i][j]);
             for (int r = 0; r < j; ++r) sum -= L[i][r] * L[j][r];
             if (i == j) {
-                const mask ok = sum > 1e-14;
+                const mask ok = held[i] | (sum > 1e-12 * Q[i][i]);  /* sum <= Q_ii: false where that is <= 0 */
                 positive &= ok;
                 L[i][i] = v_sqrt(where(ok, sum, splat(1)));
             } else
@@ -97,32 +97,75 @@ static void substitute(lane L[M][M], lane *x)
     }
 }
 
-/* The box-constrained Newton step: controls pushed out of [lb, ub] are held at the bound, the others solved again. */
+/* Moves k towards k + p as far as the first bound, in busy lanes; returns where one blocked, and marks those controls. */
+static mask step_to_bound(const lane *p, const lane *low, const lane *high, mask busy, lane *k, mask *blocked)
+{
+    lane reach[M], shortest = splat(1);
+    mask any = {0};
+    for (int i = 0; i < M; ++i) {
+        const lane room = where(p[i] > 0, high[i], low[i]) - k[i];
+        reach[i] = where(p[i] != 0, room / p[i], splat(INFINITY));
+        shortest = where(reach[i] < shortest, reach[i], shortest);
+    }
+    shortest = where(shortest < 0, (lane){0}, shortest);
+    for (int i = 0; i < M; ++i) {
+        blocked[i] = busy & (reach[i] <= shortest) & (reach[i] < 1);
+        any |= blocked[i];
+        const lane next = where(blocked[i], where(p[i] > 0, high[i], low[i]), k[i] + shortest * p[i]);
+        k[i] = where(busy, next, k[i]);
+    }
+    return any;
+}
+
+/* Lets go, in the lanes that may, the held control whose multiplier has the wrong sign by most; returns where one did. */
+static mask release(lane Q[M][M], const lane *q, const lane *k, const lane *low, mask may, mask *held)
+{
+    lane wrong[M], most = {0};
+    mask any = {0};
+    for (int i = 0; i < M; ++i) {
+        lane g = q[i];
+        for (int j = 0; j < M; ++j) g += Q[i][j] * k[j];
+        wrong[i] = where(held[i] & may, where(k[i] <= low[i], -g, g), (lane){0});
+        most = where(wrong[i] > most, wrong[i], most);
+    }
+    for (int i = 0; i < M; ++i) {
+        const mask let_go = (wrong[i] > 0) & (wrong[i] == most);
+        held[i] &= ~let_go;
+        any |= let_go;
+    }
+    return any;
+}
+
+/* min q'k + k'Q k / 2 with u + k in [lb, ub], by a primal active-set method from k = 0: the model never rises, so that k
+   is a direction of descent even where the passes end early. L is the factor of Q on the controls that end up free. */
 static mask boxed_newton(lane Q[M][M], const lane *q, const lane *u, const double *lb, const double *ub,
                          mask *held, lane *k, lane L[M][M])
 {
-    mask positive = all_lanes();
+    const int passes = 3 * M;
+    mask positive = all_lanes(), busy = all_lanes();
+    lane low[M], high[M];
     for (int i = 0; i < M; ++i) {
-        held[i] = ((u[i] <= splat(lb[i])) & (q[i] > 0)) | ((u[i] >= splat(ub[i])) & (q[i] < 0));
+        low[i] = splat(lb[i]) - u[i];
+        high[i] = splat(ub[i]) - u[i];
+        held[i] = ((low[i] >= 0) & (q[i] > 0)) | ((high[i] <= 0) & (q[i] < 0));
         k[i] = (lane){0};
     }
-    for (int pass = 0; pass <= M; ++pass) {
-        lane rhs[M];
+    for (int pass = 0;; ++pass) {
+        lane p[M];
+        mask blocked[M];
         for (int i = 0; i < M; ++i) {
-            rhs[i] = -q[i];
-            for (int j = 0; j < M; ++j) rhs[i] -= where(held[j], Q[i][j] * k[j], (lane){0});
-            rhs[i] = where(held[i], k[i], rhs[i]);
+            p[i] = -q[i];
+            for (int j = 0; j < M; ++j) p[i] -= Q[i][j] * k[j];
+            p[i] = where(held[i], (lane){0}, p[i]);
         }
-        positive &= factor(Q, held, L);
-        substitute(L, rhs);
-        for (int i = 0; i < M; ++i) {
-            const lane low = splat(lb[i]) - u[i], high = splat(ub[i]) - u[i];
-            const mask below = ~held[i] & (rhs[i] < low), above = ~held[i] & (rhs[i] > high);
-            if (pass < M) held[i] |= below | above;
-            k[i] = where(below, low, where(above, high, rhs[i]));
-        }
+        positive &= factor(Q, held, L) | ~busy;
+        substitute(L, p);
+        const mask stopped = step_to_bound(p, low, high, busy, k, blocked);
+        if (pass == passes) return positive;
+        for (int i = 0; i < M; ++i) held[i] |= blocked[i];
+        busy &= stopped | release(Q, q, k, low, busy & ~stopped, held);
+        if (!any_lane(busy)) return positive;
     }
-    return positive;
 }
 
 /* gain = -Q^-1 Qux on the free controls, 0 on those held. */

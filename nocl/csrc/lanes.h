@@ -25,6 +25,7 @@ static inline lane where(mask m, lane a, lane b) { return (lane)((m & bits(a)) |
 static inline lane truth(mask m) { return (lane)(m & bits(splat(1.0))); }
 static inline mask is_finite(lane x) { return (x - x) == (lane){0}; }
 static inline mask all_lanes(void) { return (lane){0} == (lane){0}; }
+static inline int any_lane(mask m) { int64_t any = 0; for (int i = 0; i < WIDTH; ++i) any |= m[i]; return any != 0; }
 
 #define ONE_BY_ONE(name) static inline lane v_##name(lane x) { \
     lane y; for (int i = 0; i < WIDTH; ++i) y[i] = name(x[i]); return y; }
@@ -45,7 +46,7 @@ AT_ONCE(exp) AT_ONCE(log) AT_ONCE(expm1) AT_ONCE(log1p) AT_ONCE(erf)
 AT_ONCE2(pow) AT_ONCE2(atan2) AT_ONCE2(hypot)
 ONE_BY_ONE(sqrt) ONE_BY_ONE(fabs) ONE_BY_ONE(floor) ONE_BY_ONE(ceil)
 TWO_BY_TWO(fmod) TWO_BY_TWO(remainder) TWO_BY_TWO(copysign) TWO_BY_TWO(fmin) TWO_BY_TWO(fmax)
-static inline lane v_sign(lane x) { return truth(x > 0) - truth(x < 0); }
+static inline lane v_sign(lane x) { return where(x != x, x, truth(x > 0) - truth(x < 0)); }
 
 /* Problem-major arrays [B, stride], read and written for the problems at[0..WIDTH-1]. */
 static inline lane gather(const double *array, const int64_t *at, int64_t stride, int64_t offset)

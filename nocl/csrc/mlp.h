@@ -7,7 +7,7 @@ static inline void activate(int kind, lane z, lane *f, lane *df, lane *ddf)
 {
     if (kind == 0) { *f = v_sin(z); *df = v_cos(z); *ddf = -*f; }
     else if (kind == 1) { *f = v_tanh(z); *df = 1 - *f * *f; *ddf = -2 * *f * *df; }
-    else if (kind == 2) { *f = where(z > 0, z, (lane){0}); *df = truth(z > 0); *ddf = (lane){0}; }
+    else if (kind == 2) { *f = where(z <= 0, (lane){0}, z); *df = truth(z > 0); *ddf = (lane){0}; }
     else { const lane s = 1 / (1 + v_exp(-z)); *f = z * s; *df = s * (1 + z * (1 - s));
            *ddf = s * (1 - s) * (2 + z * (1 - 2 * s)); }
 }
