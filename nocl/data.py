@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from nocl.checks import Array
 from nocl.sampling import Seed
@@ -63,7 +64,11 @@ class Trajectory:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Solutions of B optimal control problems; a failed one has success False and says why."""
+    """Solutions of B optimal control problems; a failed one has success False and says why.
+
+    `solution(t)` is (x, u, costate) at any time, by cubic Hermite polynomials between the nodes: [B, n], or
+    [B, len(t), n] for several times.
+    """
 
     trajectory: Trajectory
     cost: Array  # [B], inf where the solve failed
@@ -74,6 +79,10 @@ class Solution:
     iterations: Array  # [B]
     starts: Array | None = None  # [B], how many starts were tried
     hits: Array | None = None  # [B], how many of them reached the best cost (within 0.1 %)
+    optima: Sequence[Array] | None = None  # [B] of [n, 2]: the costs of the local optima found, rising, starts at each
+    gains: Array | None = None  # [B, K, nu, nx], du_k = -gains dx_k stays optimal; NaN: no strict optimum
+    hessian: Array | None = None  # [B, K+1, nx, nx], d2J*/dx2 at each node; NaN as in gains
+    dense: Array | None = None  # [B, K, 4, 2 nx]: (x, costate) at both ends of intervals, their time derivatives
 
     @property
     def t(self) -> Array:
@@ -86,3 +95,23 @@ class Solution:
     @property
     def u(self) -> Array:
         return self.trajectory.u
+
+    @property
+    def value_gradient(self) -> Array:
+        """dJ*/dx0 [B, nx]."""
+        return self.costate[:, 0]
+
+    def __call__(self, t: ArrayLike) -> tuple[Array, Array, Array]:
+        """(x, u, costate) at the time(s) t; ValueError outside the nodes' times, or where `dense` is missing."""
+        times = np.asarray(t, dtype=np.float64)
+        if self.dense is None:
+            raise ValueError("this Solution has no `dense`, which solution(t) interpolates: NMPC.solve gives it")
+        if times.ndim > 1 or not ((times >= self.t[0]) & (times <= self.t[-1])).all():
+            raise ValueError(f"t is {t!r}; expected a time or a list of times in [{self.t[0]:g}, {self.t[-1]:g}]")
+        k = np.clip(np.searchsorted(self.t, times, side="right") - 1, 0, len(self.t) - 2)
+        h = np.diff(self.t)[k]
+        s = (times - self.t[k]) / h
+        ends, slopes = [(1 + 2 * s) * (1 - s) ** 2, s**2 * (3 - 2 * s)], [h * s * (1 - s) ** 2, h * s**2 * (s - 1)]
+        z = np.einsum("b...en,...e->b...n", self.dense[:, k], np.stack([*ends, *slopes], axis=-1))
+        nx = self.x.shape[2]
+        return z[..., :nx], self.u[:, k], z[..., nx:]

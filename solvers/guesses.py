@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 
+import casadi as ca
 import numpy as np
 
 from nocl.checks import Array
+from nocl.data import Controller
 from nocl.ocp import OCP
 from nocl.solvers.lqr import LQR
 from nocl.solvers.transcription import Transcription
@@ -16,10 +19,15 @@ WAVES = 4  # half waves in a random control
 SCALES = (0.05, 1.0)  # of a random control, in half widths of U
 FAR = 1.5  # widths of X round the goal: a rollout that leaves them is too wild to start from
 HALVINGS = 12  # of a random control, until its rollout stays there
+BULGES = 0.1 * 1.4 ** np.arange(12)  # of a line round an obstacle, in lengths of the line
+LARGEST = 8  # nx + nu up to which mirror images of the problem are looked for, by trying all signs
+PROBES = 5  # states that a mirror image must hold at
+EQUAL = 1e-10  # relative difference of equal costs and derivatives
 
 
 def starts(program: Transcription, lqr: LQR | None, x0: Array, t: Array, n: int, seed: int) -> list[Guess]:
-    """The first n of: x0 held under u*, an LQR rollout, a straight line to the goal, smooth random controls.
+    """The first n of: x0 held under u*, an LQR rollout, a straight line to the goal, lines round each obstacle that it
+    crosses, on either side, smooth random controls.
 
     The random controls depend on `seed` alone, so that a state gets the same starts in any batch.
     """
@@ -29,6 +37,7 @@ def starts(program: Transcription, lqr: LQR | None, x0: Array, t: Array, n: int,
     if n > 1 and lqr is not None:
         found += lqr_rollout(program, lqr, x0, t)
     found.append((x0 + np.linspace(0.0, 1.0, N + 1)[:, None] * (ocp.x_goal - x0), u_goal))
+    found += [(x, u_goal) for x in (sides(ocp, x0, N) if program.n_path else [])]
     found += [controlled(program, x0, u, t) for u in random_controls(ocp, N, n - len(found), seed)]
     return found[:n]
 
@@ -88,3 +97,81 @@ def from_neighbour(x0: Array, x: Array, u: Array) -> Guess:
     """A neighbour's solution, its states moved to x0 and back to its own at the end."""
     fade = np.linspace(1, 0, len(x))[:, None]
     return x + fade * (x0 - x[0]), u
+
+
+def controller_rollout(program: Transcription, controller: Controller, x0: Array, t: Array) -> Guess:
+    """A controller (x, t) -> u from x0, sampled at the nodes, held and clipped to U; where it fails, x stays."""
+    s, N = program.ocp.system, program.N
+    x, u = np.tile(x0, (N + 1, 1)), np.tile(program.ocp.u_goal, (N, 1))
+    for k in range(N):
+        control = np.clip(np.asarray(controller(x[k], float(t[k])), dtype=np.float64).reshape(s.nu), s.lbu, s.ubu)
+        end = program.step(x[k], control, t[k + 1] - t[k])[0].full().ravel()
+        if not (np.isfinite(control).all() and np.isfinite(end).all()):
+            x[k + 1:] = x[k]
+            break
+        x[k + 1], u[k] = end, control
+    return x, u
+
+
+def sides(ocp: OCP, x0: Array, N: int) -> list[Array]:
+    """Lines from x0 to the goal [N+1, nx], bent round each obstacle that the straight one crosses, on either side."""
+    s, found = np.linspace(0.0, 1.0, N + 1)[:, None], list[Array]()
+    line = x0 + s * (ocp.x_goal - x0)
+    h = ca.vertcat(*ocp.path_constraints.values())
+    gradients = ca.Function("h_x", [ocp.system.x], [ca.jacobian(h, ocp.system.x)])
+    for i in range(len(ocp.path_constraints)):
+        values = ocp.h(line.T).full()[i]
+        k = int(np.argmin(values))
+        if values[k] >= 0:
+            continue
+        across = _across(gradients(line[k]), i, ocp.x_goal - x0)
+        if across is None:
+            continue
+        for side in (across, -across):
+            bent = (line + bulge * np.sin(np.pi * s) * side for bulge in BULGES)
+            found += [x for x in bent if ocp.h(x.T).full()[i].min() >= 0][:1]
+    return found
+
+
+def _across(gradients: ca.DM, i: int, along: Array) -> Array | None:
+    """A direction as long as `along`, at a right angle to it, in the coordinates that constraint i depends on."""
+    of = ca.DM(gradients.sparsity(), 1).full()[i] > 0
+    e = along * of
+    if of.sum() < 2 or not e.any():
+        return None
+    candidates = [gradients.full()[i] * of, *np.eye(len(along))[of]]
+    best = max((c - (c @ e) / (e @ e) * e for c in candidates), key=lambda c: float(np.linalg.norm(c)))
+    return best / np.linalg.norm(best) * np.linalg.norm(e)
+
+
+def mirrors(ocp: OCP) -> list[tuple[Array, Array]]:
+    """Signs (of x - x* [nx], of u - u* [nu]) under which f, L, G, h and U stay what they are, other than all +1.
+
+    Found by trial at random points, so up to rounding; none are looked for where nx + nu > LARGEST.
+    """
+    s = ocp.system
+    if s.nx + s.nu > LARGEST:
+        return []
+    rng, n = np.random.default_rng(0), s.nx
+    z = rng.uniform(-0.5, 0.5, (PROBES, n + s.nu)) * np.r_[s.ubx - s.lbx, s.ubu - s.lbu] / 2
+    goal = np.r_[ocp.x_goal, ocp.u_goal]
+    middle = (s.lbu + s.ubu) / 2 - ocp.u_goal  # of U: a sign may change only where u* is in it
+
+    def everything(signs: Array) -> Array:
+        x, u = np.split((z * signs + goal).T, [n])
+        f = s.f(x, u).full() * signs[:n, None]
+        return np.vstack([f, ocp.L(x, u).full(), ocp.G(x).full(), np.sort(ocp.h(x).full(), axis=0)])
+
+    same, found = everything(np.ones(n + s.nu)), []
+    for flips in itertools.product((1.0, -1.0), repeat=n + s.nu):
+        signs = np.array(flips)
+        if (signs > 0).all() or np.abs(middle[signs[n:] < 0]).max(initial=0.0) > 0:
+            continue
+        if np.abs(everything(signs) - same).max() <= EQUAL * np.abs(same).max():
+            found.append((signs[:n], signs[n:]))
+    return found
+
+
+def mirrored(ocp: OCP, mirror: tuple[Array, Array], x: Array, u: Array) -> Guess:
+    """The mirror image of states [..., nx] and controls [..., nu] at the goal pair."""
+    return ocp.x_goal + mirror[0] * (x - ocp.x_goal), ocp.u_goal + mirror[1] * (u - ocp.u_goal)

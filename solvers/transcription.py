@@ -1,13 +1,14 @@
 """Multiple shooting: an OCP as a nonlinear program with the structure that fatrop needs, and back.
 
-Variables w = [x_0, u_0, x_1, u_1, ..., x_N], parameters p = [x_0, h_0, ..., h_{N-1}], the lengths of the intervals.
+Variables w = [x_0, u_0, x_1, u_1, ..., x_N], parameters p = [x_0, h_0, ..., h_{N-1}, t_N], the lengths of the
+intervals and the time of the last node.
 Constraints, stage by stage: x_{k+1} - F(x_k, u_k; h_k) = 0, then x_0 - p = 0 at k = 0 and h(x_k) >= 0 at k >= 1. A
 gap's multiplier is minus the costate of the node that it leads to: lambda_{k+1} = dJ*/dx_{k+1}.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -50,6 +51,27 @@ class Transcription:
     soft: bool = False  # path constraints as the penalty of ocp.L_soft, not as constraints
     backend: str = "ipopt"
     options: tuple[tuple[str, Any], ...] = ()
+    terminal: ca.Function | None = None  # (x) or (x, t) -> cost at the last node; default: G
+
+    @property
+    def L(self) -> ca.Function:
+        """(x, u) -> running cost, with the penalty where `soft`."""
+        return self.ocp.L_soft if self.soft else self.ocp.L
+
+    def end_cost(self, x: Any, t: Any) -> Any:
+        """What the state x at the last node, at time t, costs."""
+        if self.terminal is None:
+            return self.ocp.G(x)
+        return self.terminal(*(x, t)[: self.terminal.n_in()])
+
+    @property
+    def sym(self) -> Any:
+        """SX.sym, or MX.sym where the dynamics are MX."""
+        return ca.SX.sym if self.f.is_a("SXFunction") else ca.MX.sym
+
+    @property
+    def expandable(self) -> bool:
+        return all(g is None or g.is_a("SXFunction") for g in (self.f, self.terminal))
 
     @property
     def n_path(self) -> int:
@@ -60,31 +82,28 @@ class Transcription:
     def step(self) -> ca.Function:
         """(x, u, h) -> (x at the end of the interval, integral of L over it)."""
         s = self.ocp.system
-        sym: Any = ca.SX.sym if self.f.is_a("SXFunction") else ca.MX.sym
-        x, u, h = sym("x", s.nx), sym("u", s.nu), sym("h")
-        L = self.ocp.L_soft if self.soft else self.ocp.L
-        end, cost = rk4_cost(self.f, L, x, u, h, self.substeps)
+        x, u, h = self.sym("x", s.nx), self.sym("u", s.nu), self.sym("h")
+        end, cost = rk4_cost(self.f, self.L, x, u, h, self.substeps)
         return ca.Function("step", [x, u, h], [end, cost], ["x", "u", "h"], ["end", "cost"])
 
     @cached_property
     def rollout(self) -> ca.Function:
         """(x0, u [nu, N], h [1, N]) -> x_1 ... x_N [nx, N]."""
         s = self.ocp.system
-        sym: Any = ca.SX.sym if self.f.is_a("SXFunction") else ca.MX.sym
-        x, u, h = sym("x", s.nx), sym("u", s.nu), sym("h")
+        x, u, h = self.sym("x", s.nx), self.sym("u", s.nu), self.sym("h")
         return ca.Function("F", [x, u, h], [rk4_interval(self.f, x, u, h, self.substeps)]).mapaccum(self.N)
 
     @cached_property
     def program(self) -> dict[str, ca.MX]:
         """x, p, f, g of the nonlinear program, in MX."""
         s, N = self.ocp.system, self.N
-        X, U, p = ca.MX.sym("x", s.nx, N + 1), ca.MX.sym("u", s.nu, N), ca.MX.sym("p", s.nx + N)
-        ends, costs = self.step.map(N)(X[:, :-1], U, p[s.nx:].T)
+        X, U, p = ca.MX.sym("x", s.nx, N + 1), ca.MX.sym("u", s.nu, N), ca.MX.sym("p", s.nx + N + 1)
+        ends, costs = self.step.map(N)(X[:, :-1], U, p[s.nx: -1].T)
         gaps = ca.horzsplit(X[:, 1:] - ends)
         paths = [X[:, 0] - p[: s.nx], *([self.ocp.h(X[:, k]) for k in range(1, N + 1)] if self.n_path else [])]
         w = ca.vertcat(*(v for k in range(N) for v in (X[:, k], U[:, k])), X[:, N])
         g = ca.vertcat(*(v for k in range(N) for v in (gaps[k], *paths[k: k + 1])), *paths[N:])
-        flat = ca.Function("flat", [X, U, p], [w, ca.sum2(costs) + self.ocp.G(X[:, N]), g])
+        flat = ca.Function("flat", [X, U, p], [w, ca.sum2(costs) + self.end_cost(X[:, N], p[-1]), g])
         w_sym = ca.MX.sym("w", w.numel())
         states, controls = self.split(w_sym)
         _, cost, constraints = flat(states, controls, p)
@@ -102,7 +121,7 @@ class Transcription:
         """The nlpsol, with exact Hessians."""
         s, N, m = self.ocp.system, self.N, self.n_path
         options: dict[str, Any] = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False,
-                                   "expand": self.f.is_a("SXFunction"), **BACKENDS.get(self.backend, {})}
+                                   "expand": self.expandable, **BACKENDS.get(self.backend, {})}
         if self.backend == "fatrop":
             options |= {"structure_detection": "manual", "N": N, "nx": [s.nx] * (N + 1), "nu": [s.nu] * N + [0],
                         "ng": [s.nx] + [m] * N}
@@ -133,19 +152,31 @@ class Transcription:
     def solve(self, x0: Array, t: Array, x: Array, u: Array) -> Answer:
         """Solve from x0 on the nodes t [N+1] with the guess x [N+1, nx], u [N, nu]."""
         w0 = np.r_[np.c_[x[:-1], u].ravel(), x[-1]]
-        result = self.solver(x0=w0, p=np.r_[x0, np.diff(t)], **self.bounds)
+        result = self.solver(x0=w0, p=np.r_[x0, np.diff(t), t[-1]], **self.bounds)
         stats = self.solver.stats()
         X, U = (v.full().T for v in self.split(result["x"]))
         U = np.clip(U, self.ocp.system.lbu, self.ocp.system.ubu)  # IPOPT relaxes bounds by 1e-8
         costate = -result["lam_g"].full().ravel()[self.gap_rows]
         worst, where = self.violation(result["g"].full().ravel(), t)
-        status = words(stats)
-        success = bool(stats["success"]) and worst <= FEASIBLE and np.isfinite(X).all()
+        iterations = int(stats.get("iter_count", 0))
+        status = words(stats, iterations >= self.max_iter)
+        success = bool(stats["success"] and worst <= FEASIBLE and np.isfinite(X).all())
         if not success:
             status += f"; worst violation {worst:.3g} of {where}" if worst > FEASIBLE else \
                 ", at a feasible point that may not be optimal"
         cost = float(result["f"]) if success else np.inf
-        return Answer(X, U, costate, cost, success, status, worst, int(stats.get("iter_count", 0)))
+        return Answer(X, U, costate, cost, success, status, worst, iterations)
+
+    @property
+    def max_iter(self) -> float:
+        """The solver's limit of iterations, where it is known."""
+        name = f"{self.backend}.max_iter"
+        return float(dict(self.options).get(name, BACKENDS.get(self.backend, {}).get(name, np.inf)))
+
+    @cached_property
+    def second(self) -> Transcription:
+        """The same program for IPOPT, which tells an infeasible problem from an unfinished solve."""
+        return replace(self, backend="ipopt", options=())
 
     def violation(self, g: Array, t: Array) -> tuple[float, str]:
         """(largest violation of a constraint, which one: what, state, node, time)."""
@@ -163,12 +194,14 @@ class Transcription:
         return float(excess[row]), f"{what} at node {node}, t = {t[node]:.4g}"
 
 
-def words(stats: dict[str, Any]) -> str:
-    """The solver's status in words: solved, infeasible, out of iterations ..."""
+def words(stats: dict[str, Any], limited: bool = False) -> str:
+    """The solver's status in words: solved, infeasible, out of iterations ...; limited: it used all its iterations."""
     status, unified = stats.get("return_status", ""), str(stats.get("unified_return_status", ""))
     plain = {"SOLVER_RET_SUCCESS": "solved", "SOLVER_RET_LIMITED": "stopped at its limit of iterations or time",
              "SOLVER_RET_INFEASIBLE": "infeasible", "SOLVER_RET_NAN": "NaN in a function",
              "SOLVER_RET_UNKNOWN": "not converged"}.get(unified, unified.lower())
     if "Infeasible" in str(status):
         plain = "infeasible"
+    elif limited and not stats.get("success"):
+        plain = "stopped at its limit of iterations"
     return f"{plain} ({status})" if isinstance(status, str) and status else plain

@@ -1,0 +1,205 @@
+"""Tasks of NMPC done here, in processes, or on a Dask cluster; outcomes streamed to a folder, for runs that resume."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import pickle
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from nocl.checks import Array
+from nocl.solvers.search import Outcome, Task
+from nocl.solvers.transcription import Answer
+
+CHUNK = 4  # tasks that a worker gets at a time
+PROBE = 4  # tasks done here first, to measure what one costs
+START = 4.0  # seconds until the processes' first result, beyond building the solver
+WORTH = 4.0  # seconds that processes must save, by measurement
+MANIFEST, TASKS = "manifest.json", "tasks"
+
+
+@dataclass(frozen=True)
+class Pool:
+    """Where tasks are done.
+
+    Parameters
+    ----------
+    workers : 1 (here), a number of processes, "auto" (processes where they pay, by the measured cost of the first
+        tasks), or the address of a Dask scheduler, "tcp://..."
+    """
+
+    workers: int | str = "auto"
+
+    def __post_init__(self) -> None:
+        w = self.workers
+        count = isinstance(w, (int, np.integer)) and not isinstance(w, bool) and w >= 1
+        if not count and not (isinstance(w, str) and (w == "auto" or "://" in w)):
+            raise ValueError(f"workers is {w!r}; expected a number >= 1, 'auto', or a Dask scheduler's 'tcp://...'")
+
+    def outcomes(self, job: Any, tasks: Sequence[Task]) -> Iterator[Outcome]:
+        """Each task's outcome once, in any order; `job(task)` does one, and pickles."""
+        if isinstance(self.workers, str) and self.workers != "auto":
+            yield from _on_cluster(self.workers, job, tasks)
+        elif self.workers == "auto":
+            yield from _measured(job, tasks)
+        elif len(tasks) > CHUNK and int(self.workers) > 1:
+            yield from _in_processes(int(self.workers), job, tasks)
+        else:
+            yield from map(job, tasks)
+
+
+def cores() -> int:
+    """Processor cores that this process may use."""
+    from joblib import cpu_count
+
+    return int(cpu_count())
+
+
+def _measured(job: Any, tasks: Sequence[Task]) -> Iterator[Outcome]:
+    """The first tasks here; the rest in processes where that saves more than WORTH seconds."""
+    begin = time.perf_counter()
+    job.build()
+    building = time.perf_counter() - begin
+    begin = time.perf_counter()
+    yield from map(job, tasks[:PROBE])
+    rest, k = tasks[PROBE:], cores()
+    here = (time.perf_counter() - begin) / PROBE * len(rest)
+    if k > 1 and here * (1 - 1 / k) - START - building > WORTH:
+        yield from _in_processes(k, job, rest)
+    else:
+        yield from map(job, rest)
+
+
+def _chunks(tasks: Sequence[Task]) -> list[Sequence[Task]]:
+    return [tasks[i: i + CHUNK] for i in range(0, len(tasks), CHUNK)]
+
+
+def _in_processes(k: int, job: Any, tasks: Sequence[Task]) -> Iterator[Outcome]:
+    from joblib import Parallel, delayed
+
+    data = pickle.dumps(job)
+    work = Parallel(n_jobs=k, backend="loky", batch_size=1, pre_dispatch="2*n_jobs", return_as="generator_unordered")
+    for outcomes in work(delayed(_work)(data, chunk) for chunk in _chunks(tasks)):
+        yield from outcomes
+
+
+def _on_cluster(address: str, job: Any, tasks: Sequence[Task]) -> Iterator[Outcome]:
+    """A task of a worker that dies is given to another by the scheduler; each outcome is taken once."""
+    try:
+        from distributed import Client, as_completed
+    except ImportError as error:
+        raise ValueError(f"workers={address!r} needs Dask: pip install 'nocl[cluster]'") from error
+    try:
+        client = Client(address, timeout="10s", set_as_default=False)
+    except OSError as error:
+        raise ValueError(f"no Dask scheduler answers at {address}: {error}; start one with `dask scheduler`") from error
+    with client:
+        data = client.scatter(pickle.dumps(job), broadcast=True, hash=False)
+        futures = [client.submit(_work, data, chunk, pure=False) for chunk in _chunks(tasks)]
+        for future in as_completed(futures):
+            yield from future.result()
+            future.release()
+
+
+@lru_cache(maxsize=2)
+def _job(data: bytes) -> Any:
+    """The job of this worker process, unpickled once, so that its solver is built once."""
+    return pickle.loads(data)
+
+
+def _work(data: bytes, tasks: Sequence[Task]) -> list[Outcome]:
+    return [_job(data)(task) for task in tasks]
+
+
+@dataclass(frozen=True)
+class Journal:
+    """Outcomes in a folder, a data-only file each, written whole or not at all.
+
+    Raises ValueError where the folder holds another run, or something else.
+    """
+
+    folder: Path | None
+    key: str = ""
+
+    def __post_init__(self) -> None:
+        if self.folder is None:
+            return
+        manifest = self.folder / MANIFEST
+        if manifest.exists():
+            found = json.loads(manifest.read_text())
+            if found.get("key") != self.key:
+                raise ValueError(f"{self.folder} holds another run of NMPC (other states, problem, settings or "
+                                 "versions); expected the same one, or a new folder: change `out`")
+        elif self.folder.exists() and any(self.folder.iterdir()):
+            raise ValueError(f"{self.folder} is not empty and holds no run of NMPC; expected a new folder: change out")
+        (self.folder / TASKS).mkdir(parents=True, exist_ok=True)
+        _write(manifest, json.dumps({"kind": "nocl NMPC run", "key": self.key}).encode())
+
+    def file(self, name: str) -> Path:
+        assert self.folder is not None
+        return self.folder / TASKS / f"{name}.npz"
+
+    def read(self, task: Task) -> Outcome | None:
+        """What was found before, if anything."""
+        if self.folder is None or not self.file(task.name).exists():
+            return None
+        with np.load(self.file(task.name), allow_pickle=False) as data:
+            arrays = {name: data[name] for name in data.files}
+        return Outcome(task.name, task.row, arrays["costs"], float(arrays["seconds"]), int(arrays["iterations"]),
+                       _answer(arrays, "best"), _answer(arrays, "failed"))
+
+    def write(self, outcome: Outcome) -> None:
+        if self.folder is None:
+            return
+        arrays: dict[str, Any] = {"costs": outcome.costs, "seconds": outcome.seconds, "iterations": outcome.iterations}
+        for kind in ("best", "failed"):
+            answer = getattr(outcome, kind)
+            arrays |= {} if answer is None else {f"{kind}.{name}": value for name, value in vars(answer).items()}
+        target = self.file(outcome.name)
+        part = target.with_name(f".{target.stem}-{os.getpid()}.part.npz")
+        np.savez(part, **arrays)
+        os.replace(part, target)
+
+
+def _answer(arrays: dict[str, Array], kind: str) -> Answer | None:
+    fields: dict[str, Any] = {name.removeprefix(f"{kind}."): value if value.ndim else value.item()
+                              for name, value in arrays.items() if name.startswith(f"{kind}.")}
+    return Answer(**fields) if fields else None
+
+
+def _write(target: Path, content: bytes) -> None:
+    part = target.with_name(f".{target.name}-{os.getpid()}.part")
+    part.write_bytes(content)
+    os.replace(part, target)
+
+
+def do(job: Any, tasks: Sequence[Task], pool: Pool, journal: Journal, show: bool, what: str) -> list[Outcome]:
+    """The outcomes of all tasks, in their order: those of the journal, the others done now and written at once."""
+    done = {task.name: found for task in tasks if (found := journal.read(task)) is not None}
+    todo = [task for task in tasks if task.name not in done]
+    with tqdm(total=len(tasks), initial=len(done), desc=what, unit="state", delay=3.0, leave=False,
+              disable=not show or len(todo) < 2) as bar:
+        for outcome in pool.outcomes(job, todo):
+            journal.write(outcome)
+            done[outcome.name] = outcome
+            bar.update()
+    return [done[task.name] for task in tasks]
+
+
+def fingerprint(*parts: Any) -> str:
+    """A hash of bytes, strings, numbers and arrays."""
+    total = hashlib.sha256()
+    for part in parts:
+        data = part if isinstance(part, bytes) else np.ascontiguousarray(part).tobytes() if isinstance(
+            part, np.ndarray) else repr(part).encode()
+        total.update(f"{len(data)}:".encode() + data)
+    return total.hexdigest()[:32]
