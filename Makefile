@@ -1,5 +1,6 @@
 # make demo   sets up .venv and runs the main job on cart-pole, ending with the report
 # make test   sets up .venv, lints and tests; make test-slow also runs the tests of minutes
+# make pretrained   makes the controllers that ship with nocl again
 # Needs Python 3.11, gcc, g++ and make; everything else comes from the package registry.
 
 PYTHON ?= python3.11
@@ -13,7 +14,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_NO_INPUT := 1
 PIP := $(BIN)/python -m pip install --quiet --no-compile# saves half a minute: most modules are never imported
 
-.PHONY: demo test test-slow lint set-up clean
+.PHONY: demo pretrained test test-slow lint set-up clean
 
 demo: set-up
 	$(BIN)/nocl run cartpole --out runs/cartpole
@@ -23,6 +24,9 @@ test: lint
 
 test-slow: lint
 	$(BIN)/python -m pytest
+
+pretrained: set-up
+	$(BIN)/python benchmarks/controllers.py --seeds 0 --keep nocl/pretrained --results pretrained
 
 lint: set-up
 	$(BIN)/ruff check .

@@ -96,6 +96,7 @@ def main() -> None:
     parser.add_argument("--n", type=int, default=200)
     parser.add_argument("--sigma", type=float, default=0.05)
     parser.add_argument("--keep", type=Path, help="save the controllers of the first seed in this folder")
+    parser.add_argument("--results", default="controllers", help="benchmarks/results/RESULTS.json")
     options, rows = parser.parse_args(), []
     for problem in options.problems:
         ocp = nocl.load_ocp(problem)
@@ -108,7 +109,7 @@ def main() -> None:
                 rows.append({"problem": problem, "dynamics": dynamics, "seed": seed, "train_seconds": seconds,
                              **score(ocp, cnd, options.n, options.sigma)})
                 print(rows[-1], flush=True)
-                provenance.write("controllers", rows, n=options.n, sigma=options.sigma)
+                provenance.write(options.results, rows, n=options.n, sigma=options.sigma)
                 if options.keep and seed == options.seeds[0]:
                     cnd.card["score"] = rows[-1]
                     cnd.save(options.keep / f"{problem}-{dynamics}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,6 @@ from nocl.ocp import OCP
 from nocl.to_casadi import to_casadi
 
 KIND = "cnd"  # the name of its file in a folder
-PRETRAINED = Path(__file__).resolve().parents[2] / "nocl" / "pretrained"
 
 
 class CND:
@@ -123,9 +123,10 @@ def pretrained(name: str, dynamics: str = "exact") -> CND:
     """A controller that comes with nocl, trained on the exact f or on a learned one (dynamics="learned")."""
     if dynamics not in ("exact", "learned"):
         raise ValueError(f"dynamics is {dynamics!r}; expected 'exact' or 'learned'")
-    folder = PRETRAINED / f"{name}-{dynamics}"
+    shipped = Path(str(files("nocl"))) / "pretrained"
+    folder = shipped / f"{name}-{dynamics}"
     if not folder.is_dir():
-        there = ", ".join(sorted(p.name for p in PRETRAINED.glob("*-*"))) or "none"
+        there = ", ".join(sorted(p.name for p in shipped.glob("*-*"))) or "none"
         raise ValueError(f"no pretrained controller {name!r} on {dynamics} dynamics; there are: {there}. "
                          f"Train one: nocl.train(nocl.load_ocp({name!r}))")
     return CND.load(folder)
