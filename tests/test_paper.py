@@ -29,7 +29,7 @@ TINY = {"iterations": 4, "batch": 4, "race": 2, "race_iterations": 2, "race_batc
     ({"learning_rate": 0.0}, "learning_rate"), ({"learning_rate": None}, "learning_rate"), ({"decay": 2.0}, "decay"),
     ({"decay": math.nan}, "decay"), ({"clip": -1.0}, "clip"), ({"clip": "no"}, "clip"),
     ({"weights": (1, 1)}, "weights"), ({"weights": (1, -1, 0, 0)}, "weights"), ({"weights": (0, 1, 0, 0)}, "weights"),
-    ({"weights": 1.0}, "weights"), ({"step": "euler", "hold": False}, "step")])
+    ({"weights": 1.0}, "weights"), ({"step": "euler"}, "step"), ({"hold": 0}, "hold")])
 def test_settings_say_what_is_wrong(wrong, named):
     with pytest.raises(ValueError, match=rf"PaperSettings: {named} is .*expected"):
         PaperSettings(**wrong)
@@ -108,7 +108,7 @@ def test_a_seed_is_a_controller_and_the_callers_generators_are_left_alone():
 
 def test_fused_and_torch_training_agree():
     ocp = double_integrator.ocp()
-    runs = [train_paper(ocp, None, PaperSettings(**TINY, fused=fused), progress=False, dtype=torch.float64)
+    runs = [train_paper(ocp, None, PaperSettings(**TINY, hold=True, fused=fused), progress=False, dtype=torch.float64)
             for fused in (True, False)]
     for a, b in zip(*(outputs(run[:2], ocp) for run in runs), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-8)
@@ -142,8 +142,8 @@ def judged(ocp, policy, n=20):
 
 def test_double_integrator_reaches_the_cost_of_lqr():
     ocp = double_integrator.ocp()
-    policy, *_ = train(ocp, time_input=True, intervals=20, iterations=300, batch=32, race=1, learning_rate=0.03,
-                       decay=0.1)
+    policy, *_ = train(ocp, time_input=True, hold=True, intervals=20, iterations=300, batch=32, race=1,
+                       learning_rate=0.03, decay=0.1)
     run = judged(ocp, policy)
     S = np.linalg.inv(np.eye(2) + np.array([[8 / 3, 2.0], [2.0, 2.0]]) / 0.01)  # (P^-1 + W(T))^-1, T = 2
     Phi = np.array([[1.0, 2.0], [0.0, 1.0]])
@@ -153,14 +153,22 @@ def test_double_integrator_reaches_the_cost_of_lqr():
     assert run.cost.mean() < 1.2 * best.mean()
 
 
-@pytest.mark.parametrize("settings", [{"hold": False}, {"step": "euler"}, {"detach": True}, {"clip": None, "race": 1}])
-def test_each_option_trains(settings):
+SHORT = {**TINY, "iterations": 40}
+
+
+@pytest.fixture(scope="module")
+def short():
+    return outputs(train(double_integrator.ocp(), **SHORT)[:2], double_integrator.ocp())
+
+
+@pytest.mark.parametrize("settings", [{"hold": True}, {"step": "euler", "hold": True}, {"detach": True},
+                                      {"clip": None, "race": 1}])
+def test_each_option_trains(settings, short):
     ocp = double_integrator.ocp()
-    *nets, card = train(ocp, **{**TINY, "iterations": 60, "intervals": 10, **settings})
+    *nets, card = train(ocp, **{**SHORT, **settings})
     first, last = np.reshape(card["history"]["cost"], (2, -1)).mean(1)
     assert last < first
-    different = train(ocp, **{**TINY, "iterations": 60, "intervals": 10})[:2]
-    assert not torch.equal(outputs(nets, ocp)[1], outputs(different, ocp)[1])
+    assert not torch.equal(outputs(nets, ocp)[1], short[1])
 
 
 def test_a_system_of_ones_own_goes_through():

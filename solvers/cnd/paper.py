@@ -8,8 +8,12 @@ departs from it because the plain recipe fails, is a field of `PaperSettings`, a
 - clip: gradients through a swing-up reach norms of 10^3 at random controllers; unclipped, training throws them away.
 - race: from one random start the swing-up is a matter of luck; several start side by side on L_cost, the best goes on.
 - sin_cos: angles go in as sin and cos too, so that u is periodic where it should be.
-- rollouts are RK4 with the control held over each interval, nocl's one discretisation; step="euler" for that of the
-  published code.
+- rollouts are RK4 with the controller inside the ODE. With hold=True they are nocl's discretisation for NMPC, several
+  times as fast (the race's always are), but then the controller is one for that control rate: trained at 12.5 Hz to
+  cost 0.106, cart-pole's has 0.67 in continuous time; trained inside the ODE, 0.147 in a quarter of the iterations.
+  step="euler" with hold=True is the published code.
+
+Without clip, race and sin_cos cart-pole's cost is 4.5 after 600 iterations (it does not swing up; one seed).
 """
 
 from __future__ import annotations
@@ -52,19 +56,19 @@ class PaperSettings:
     activation: str = "tanh"
     time_input: bool = False  # True: u(x, t), which the optimum of a finite horizon needs; the paper has u(x)
     sin_cos: bool = True  # sin and cos of declared angles as inputs, beside their values
-    intervals: int = 50  # K: steps of a rollout, controls held over each
+    intervals: int = 40  # K: steps of a rollout
     step: str = "rk4"  # or "euler", as published
-    hold: bool = True  # controls held over each interval; False: feedback in continuous time, inside RK4's stages
-    fused: bool = True  # RK4 steps of the exact f as compiled C on the CPU; False: in torch, with the same gradients
-    iterations: int = 1500  # of Adam, after the race
-    batch: int = 128  # initial states an iteration
+    hold: bool = False  # False: feedback inside RK4's stages, as in a neural ODE; True: held over intervals
+    fused: bool = True  # held RK4 steps of the exact f as compiled C on the CPU; False: in torch, same gradients
+    iterations: int = 1000  # of Adam, after the race
+    batch: int = 64  # initial states an iteration
     learning_rate: float = 0.01
     decay: float = 0.01  # the learning rate falls exponentially, to this share of its start
     weights: tuple[float, float, float, float] = (1.0, 1.0, 0.01, 0.01)  # of L_cost, L_HJB, L_final, L_hamil
     clip: float | None = 1.0  # the gradient's norm, of u and of V each; None: not clipped
     detach: bool = False  # True: L_HJB, L_final, L_hamil see the trajectory's states as constants
     race: int = 8  # random initial controllers that start side by side; 1: no race
-    race_iterations: int = 250  # of L_cost alone, for each of them
+    race_iterations: int = 200  # of L_cost alone, for each of them
     race_batch: int = 16  # initial states an iteration, for each of them
 
     def __post_init__(self) -> None:
@@ -77,6 +81,9 @@ class PaperSettings:
             if not _is_count(getattr(self, name)):
                 raise ValueError(f"PaperSettings: {name} is {getattr(self, name)!r}; expected an integer >= 1")
         self._check_numbers()
+        for name in ("time_input", "sin_cos", "hold", "fused", "detach"):
+            if not isinstance(getattr(self, name), bool):
+                raise ValueError(f"PaperSettings: {name} is {getattr(self, name)!r}; expected True or False")
         if not self.hold and self.step != "rk4":
             raise ValueError(f"PaperSettings: step is {self.step!r} with hold=False; expected step='rk4', which "
                              "feedback in continuous time is integrated by")
