@@ -174,7 +174,7 @@ def _predicted(method: Any, x0: Array) -> Array:
 
 
 def _solve(solver: Any, x0: Array, progress: bool | None) -> list[Solution | str]:
-    """Solutions of all states at once; where that raises, state by state, with what was raised instead of a Solution."""
+    """Solutions of all states at once; where that raises, state by state, what was raised in place of a Solution."""
     takes = "progress" in inspect.signature(solver.solve).parameters
     try:
         return [solver.solve(x0, progress=progress) if takes else solver.solve(x0)]

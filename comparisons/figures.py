@@ -1,0 +1,142 @@
+"""The pictures of a report, by matplotlib's object interface: no global state, no window."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from nocl.checks import Array
+from nocl.comparisons.report import Report, percent
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")  # Okabe, Ito: safe for all eyes
+DASHES = ("-", "--", "-.", ":")
+STYLE: dict[Any, Any] = {"svg.fonttype": "path", "svg.hashsalt": "nocl", "font.size": 9, "axes.spines.top": False,
+         "axes.spines.right": False, "axes.grid": True, "grid.alpha": 0.25, "legend.frameon": False}
+SMALL_GAP = 1e-2  # per cent: the gap axis is linear below it
+
+
+def draw(report: Report) -> dict[str, Figure]:
+    """All figures of a report by name; `costs` only where there are two methods to set side by side."""
+    with matplotlib.rc_context(STYLE):
+        figures = {"gaps": gaps(report)}
+        if len(report.judged) > 1:
+            figures["costs"] = costs(report)
+        figures["trajectories"] = trajectories(report, typical_states(report))
+        figures["worst"] = trajectories(report, worst_states(report)[:3])
+        for figure in figures.values():  # laid out once, not for each file
+            figure.draw_without_rendering()
+            figure.set_layout_engine("none")
+        return figures
+
+
+NAMES = ("gaps", "costs", "trajectories", "worst")  # the names that `draw` may use
+
+
+def encode(figure: Figure, form: str) -> bytes:
+    """A figure as SVG or PNG, the same bytes for the same report."""
+    file = io.BytesIO()
+    with matplotlib.rc_context(STYLE):
+        figure.savefig(file, format=form, dpi=150, metadata={"Date": None} if form == "svg" else {"Software": None})
+    return file.getvalue()
+
+
+def data_uri(svg: bytes) -> str:
+    return "data:image/svg+xml;base64," + base64.b64encode(svg).decode()
+
+
+def look(m: int) -> dict[str, Any]:
+    """Colour and dash of the m-th method: they tell methods apart without colour, too."""
+    return {"color": COLOURS[m % len(COLOURS)], "linestyle": DASHES[m % len(DASHES)]}
+
+
+def worst_states(report: Report) -> list[int]:
+    """States by the gap of the first method, the widest first."""
+    return np.argsort(-report.gap[0], kind="stable").tolist()
+
+
+def typical_states(report: Report) -> list[int]:
+    """Where the first method's gap is the least, at its median, and the widest."""
+    order = worst_states(report)
+    return list(dict.fromkeys([order[-1], order[len(order) // 2], order[0]]))
+
+
+def gaps(report: Report) -> Figure:
+    """Share of initial states within a gap; a method's line ends below 100 % where it failed."""
+    figure = Figure(figsize=(7, 3.6), layout="constrained")
+    ax = figure.subplots()
+    n = len(report.x0)
+    right = max(10.0, 2 * float(np.max(report.gap, where=np.isfinite(report.gap), initial=0.0)))
+    for m, judged in enumerate(report.judged):
+        known = np.sort(report.gap[m][report.feasible[m] & np.isfinite(report.gap[m])])
+        share = 100 * np.arange(1, len(known) + 1) / n
+        ax.step(np.r_[0, known, right], np.r_[0, share, 100 * len(known) / n], where="post", label=judged.name, **look(m))
+    ax.set_xscale("symlog", linthresh=SMALL_GAP)
+    for x, text in ((1, "1 %"), (5, "5 %")):
+        ax.axvline(x, color="0.6", linewidth=0.8)
+        ax.text(x, 2, f" {text}", color="0.4", fontsize=8)
+    ax.set(xlabel="gap to the best known cost of the state [%]", ylabel="initial states [%]", ylim=(0, 103))
+    ax.set_xlim(-SMALL_GAP / 5, right)
+    ax.legend(loc="center right")
+    return figure
+
+
+def costs(report: Report) -> Figure:
+    """Cost of each state, one method against the reference: the last one named."""
+    figure = Figure(figsize=(4.8, 4.4), layout="constrained")
+    ax = figure.subplots()
+    reference = report.cost[-1]
+    both = np.isfinite(report.cost).all(axis=0)
+    for m, judged in enumerate(report.judged[:-1]):
+        ok = np.isfinite(report.cost[m]) & np.isfinite(reference)
+        ax.plot(reference[ok], report.cost[m][ok], linestyle="", marker="ox^s"[m % 4], markersize=4, alpha=0.7,
+                color=COLOURS[m % len(COLOURS)], label=judged.name)
+    if both.any():
+        low, high = report.cost[:, both].min(), report.cost[:, both].max()
+        ax.plot([low, high], [low, high], color="0.5", linewidth=0.8, label="equal")
+        if low > 0 and high > 20 * low:
+            ax.set(xscale="log", yscale="log")
+    others = report.judged[0].name if len(report.judged) == 2 else "the others"
+    ax.set(xlabel=f"cost of {report.judged[-1].name}", ylabel=f"cost of {others}")
+    ax.legend()
+    return figure
+
+
+def trajectories(report: Report, states: Sequence[int]) -> Figure:
+    """States and controls over time; a column for each initial state, a line for each method."""
+    s = report.ocp.system
+    names = [s.unit(name) for name in s.names]
+    figure = Figure(figsize=(3.1 * len(states) + 0.9, 1.15 * len(names) + 0.9), layout="constrained")
+    axes = figure.subplots(len(names), len(states), sharex=True, sharey="row", squeeze=False)
+    for c, i in enumerate(states):
+        axes[0, c].set_title(f"state {i}: " + _gap_title(report, i), fontsize=8)
+        axes[-1, c].set_xlabel("t")
+        for m, judged in enumerate(report.judged):
+            _draw_run(axes[:, c], judged.simulation.t, judged.simulation.x[i], judged.simulation.u[i], m, judged.name,
+                      steps="held" in judged.how)
+        for ax, goal in zip(axes[:, c], np.r_[report.ocp.x_goal, report.ocp.u_goal], strict=True):
+            ax.axhline(goal, color="0.6", linewidth=0.7, zorder=0)
+    for ax, name in zip(axes[:, 0], names, strict=True):
+        ax.set_ylabel(name)
+    handles, labels = axes[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 4))
+    return figure
+
+
+def _gap_title(report: Report, i: int) -> str:
+    gap = report.gap[0, i]
+    name = report.judged[0].name
+    return f"{name} +{percent(max(gap, 0.0))} %" if np.isfinite(gap) else f"{name} failed"
+
+
+def _draw_run(axes: Any, t: Array, x: Array, u: Array, m: int, name: str, steps: bool) -> None:
+    nx = x.shape[1]
+    for k, ax in enumerate(axes):
+        y = x[:, k] if k < nx else u[:, k - nx]
+        style = {"drawstyle": "steps-post"} if steps and k >= nx else {}
+        ax.plot(t, y, linewidth=1.3, label=name, **style, **look(m))
