@@ -58,7 +58,7 @@ def bounds(lower: ArrayLike, upper: ArrayLike, n: int, names: tuple[str, str], o
 
 
 # CasADi before 3.8.2 loses a sign when it differentiates copysign(x, y) at x < 0: no labels from it
-COPYSIGN_WRONG = tuple(int(n) for n in ca.__version__.split(".")[:3]) < (3, 8, 2)
+COPYSIGN_WRONG = tuple(int(n) for n in ca.CasadiMeta.version().split(".")[:3]) < (3, 8, 2)
 
 
 class FrozenSX(ca.SX):
@@ -129,7 +129,7 @@ def expression(value: Any, rows: int, allowed: ca.SX, name: str, owner: str, con
         raise ValueError(f"{owner}: {name} has shape {value.shape}, expected ({rows}, 1): "
                          f"{'one row per state, by ca.vertcat(...)' if rows > 1 else 'a scalar expression'}")
     if COPYSIGN_WRONG and _uses(value, ca.OP_COPYSIGN):
-        raise ValueError(f"{owner}: {name} contains copysign, which CasADi {ca.__version__} differentiates wrongly: "
+        raise ValueError(f"{owner}: {name} contains copysign, which CasADi {ca.CasadiMeta.version()} differentiates wrongly: "
                          f"install CasADi 3.8.2 or later, or write it by if_else")
     free = [s for s in ca.symvar(value) if not ca.depends_on(s, allowed)]
     used = [s.name() for s in free if controls is not None and ca.depends_on(s, controls)]
