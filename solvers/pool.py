@@ -24,6 +24,7 @@ CHUNK = 4  # tasks that a worker gets at a time
 PROBE = 4  # tasks done here first, to measure what one costs
 START = 4.0  # seconds until the processes' first result, beyond building the solver
 WORTH = 4.0  # seconds that processes must save, by measurement
+CONNECT = 10.0  # seconds to wait for a scheduler
 MANIFEST, TASKS = "manifest.json", "tasks"
 
 
@@ -47,6 +48,8 @@ class Pool:
 
     def outcomes(self, job: Any, tasks: Sequence[Task]) -> Iterator[Outcome]:
         """Each task's outcome once, in any order; `job(task)` does one, and pickles."""
+        if not tasks:
+            return
         if isinstance(self.workers, str) and self.workers != "auto":
             yield from _on_cluster(self.workers, job, tasks)
         elif self.workers == "auto":
@@ -99,13 +102,13 @@ def _on_cluster(address: str, job: Any, tasks: Sequence[Task]) -> Iterator[Outco
     except ImportError as error:
         raise ValueError(f"workers={address!r} needs Dask: pip install 'nocl[cluster]'") from error
     try:
-        client = Client(address, timeout="10s", set_as_default=False)
+        client = Client(address, timeout=CONNECT, set_as_default=False)
     except OSError as error:
         raise ValueError(f"no Dask scheduler answers at {address}: {error}; start one with `dask scheduler`") from error
     with client:
-        data = client.scatter(pickle.dumps(job), broadcast=True, hash=False)
+        data = pickle.dumps(job)  # with each chunk: scattered data would be lost with the worker that holds it
         futures = [client.submit(_work, data, chunk, pure=False) for chunk in _chunks(tasks)]
-        for future in as_completed(futures):
+        for future in as_completed(futures, loop=client.loop):
             yield from future.result()
             future.release()
 
