@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import KDTree
 
 from nocl import checks
 from nocl.checks import Array
@@ -17,6 +18,7 @@ from nocl.solvers.ddp import DDP, DDPSolution
 Report = Callable[[str], None]  # told what is being done
 IMPROVED = 1e-6  # a cost lower by this share counts as an improvement
 SAME = 1e-3  # costs within this share count as the same optimum
+TINY = 1e-10  # ... and costs below it are equal
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +34,12 @@ class SolutionBank:
     @staticmethod
     def of(ddp: DDP, solution: DDPSolution) -> SolutionBank:
         """A bank of the solutions that succeeded; states are compared in units of their spread along them."""
+        if (solution.t[:, 0] != 0).any():
+            raise ValueError(f"a bank holds solutions from t0 = 0; got t0 up to {solution.t[:, 0].max():g}: solve them "
+                             "from t0 = 0")
         kept = solution[solution.success]
+        if not len(solution):
+            raise ValueError(f"a bank of {ddp.ocp.system.name} got no solutions; expected at least one")
         if not len(kept):
             raise ValueError(f"no problem of {ddp.ocp.system.name} was solved ({solution.message[0]}): check the "
                              "horizon, the bounds and the costs, or give guesses of your own to DDP.solve(x0, u=...)")
@@ -46,11 +53,18 @@ class SolutionBank:
         return SolutionBank.of(ddp, DDPSolution(**arrays, V_xx=None, message=message))
 
     def nearest(self, x: Array, t: ArrayLike = 0.0, count: int = 1) -> NDArray[np.int64]:
-        """The `count` rows whose states at t are nearest to x [B, nx]: [B, count]."""
-        nodes = self.solution.x[:, self._interval(np.broadcast_to(t, len(x))), :]  # [rows, B, nx]
-        distance = (((nodes - x) / self.scale) ** 2).sum(axis=2).T
-        count = min(count, len(self))
-        return np.argpartition(distance, count - 1, axis=1)[:, :count]
+        """The `count` rows whose states at t (at the last node before it) are nearest to x [B, nx], the nearest first.
+
+        t: a number or [B]. Returns [B, count], fewer columns where the bank has fewer rows.
+        """
+        columns = list(range(1, min(count, len(self)) + 1))
+        found = np.empty((len(x), len(columns)), dtype=np.int64)
+        interval = np.broadcast_to(self._interval(t), len(x))
+        for k in np.unique(interval):
+            here = interval == k
+            tree = KDTree(self.solution.x[:, k] / self.scale)
+            found[here] = tree.query(x[here] / self.scale, columns)[1]
+        return found
 
     def guess(self, rows: NDArray[np.int64], t0: ArrayLike = 0.0) -> dict[str, Array]:
         """What DDP.solve starts from: solutions `rows` [B] resampled onto their own [t0, T], as u, x and gain."""
@@ -102,31 +116,97 @@ def solve_globally(ddp: DDP, x0: ArrayLike, *, starts: int = 16, neighbours: int
                    report: Report = lambda _: None) -> GlobalSolution:
     """Solve each problem from u* and cold starts, then from its neighbours' solutions until nothing improves.
 
+    Neighbours alone come to rest where a whole region shares a wrong basin: a random half of the states gets one more
+    cold start in each round, and so does each state whose best was found less than twice.
+
     Parameters
     ----------
     x0 : [nx] or [B, nx], at t0 = 0
     starts : cold starts for each state, u held at u* the first of them
     neighbours, rounds : solutions of that many neighbours are tried, at most that many times over
+
+    Raises ValueError for wrong input; a state for which nothing converged has success False in `best`.
     """
     rows, _ = checks.states(x0, ddp.ocp.system.nx, ddp.ocp.system.name)
-    rng, B = np.random.default_rng(seed), len(rows)
-    controls = cold_controls(ddp, B * starts, rng).reshape(B, starts, ddp.intervals, -1)
-    controls[:, 0] = ddp.ocp.u_goal
-    tried, costs = None, np.empty((B, 0))
+    if min(starts, neighbours + 1, rounds + 1) < 1:
+        raise ValueError(f"starts is {starts}, neighbours {neighbours}, rounds {rounds}; expected starts >= 1, the "
+                         "others >= 0")
+    search = _Search(ddp, rows, np.random.default_rng(seed))
     for start in range(starts):
         report(f"cold start {start + 1} of {starts}")
-        solution = ddp.solve(rows, u=np.ascontiguousarray(controls[:, start]))
-        costs = np.column_stack([costs, solution.cost])
-        tried = solution if tried is None else better(tried, solution)
-    assert tried is not None
+        search.cold(np.arange(len(rows)), straight=start == 0)
     for round_ in range(rounds):
-        report(f"neighbours, round {round_ + 1}")
-        former = tried.cost
-        tried, found = _from_neighbours(ddp, tried, rows, neighbours)
-        costs = np.column_stack([costs, found])
-        if not (tried.cost < former - IMPROVED * np.abs(former)).any():
+        if not search.best.success.any():
             break
-    return GlobalSolution(tried, np.full(B, costs.shape[1]), _hits(costs, tried.cost), _distinct(costs))
+        report(f"neighbours, round {round_ + 1}")
+        former = search.best.cost
+        search.exchange(neighbours)
+        search.cold(search.doubtful())
+        if not _improved(former, search.best.cost).any():
+            break
+    return GlobalSolution(search.best, *search.counts())
+
+
+class _Search:
+    """The best of all that was tried from each state, and the costs at which each start ended."""
+
+    def __init__(self, ddp: DDP, x0: Array, rng: np.random.Generator) -> None:
+        self.ddp, self.x0, self.rng = ddp, x0, rng
+        self.best: DDPSolution
+        self.owners: list[NDArray[np.int64]] = []  # of each start, its state
+        self.costs: list[Array] = []
+        self.tried: set[tuple[int, int, float]] = set()  # (state, neighbour, the neighbour's cost)
+
+    def cold(self, rows: NDArray[np.int64], straight: bool = False) -> None:
+        """One cold start for each of these states, u held at u* or random."""
+        if straight:
+            self.best = self.ddp.solve(self.x0[rows])
+            self._count(rows, self.best)
+        elif rows.size:
+            self._merge(rows, self.ddp.solve(self.x0[rows], u=cold_controls(self.ddp, len(rows), self.rng)))
+
+    def exchange(self, neighbours: int) -> None:
+        """Solve each state from the nearest others' solutions, if they are new to it."""
+        solved = np.flatnonzero(self.best.success)
+        bank = SolutionBank.of(self.ddp, self.best)
+        near = bank.nearest(self.x0, count=neighbours + 1)
+        for column in near.T:
+            pairs = [(i, k) for i, k in enumerate(column) if solved[k] != i and self._new(i, int(solved[k]))]
+            if pairs:
+                rows, parents = np.array(pairs).T
+                self._merge(rows, self.ddp.solve(self.x0[rows], **bank.guess(parents)))
+
+    def _new(self, state: int, other: int) -> bool:
+        key = (state, other, float(self.best.cost[other]))
+        fresh = key not in self.tried
+        self.tried.add(key)
+        return fresh
+
+    def doubtful(self) -> NDArray[np.int64]:
+        """A random half of the states, and those whose best was found less than twice."""
+        _, hits, _ = self.counts()
+        return np.flatnonzero((self.rng.random(len(self.x0)) < 0.5) | (hits < 2))
+
+    def _merge(self, rows: NDArray[np.int64], found: DDPSolution) -> None:
+        self._count(rows, found)
+        whole = better(self.best[rows], found)
+        order = np.arange(len(self.x0))
+        order[rows] = len(self.x0) + np.arange(len(rows))
+        self.best = DDPSolution.join([self.best, whole])[order]
+
+    def _count(self, rows: NDArray[np.int64], found: DDPSolution) -> None:
+        self.owners.append(rows)
+        self.costs.append(found.cost)
+
+    def counts(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """(starts, those that ended at the best cost, different costs) of each state."""
+        owners, costs = np.concatenate(self.owners), np.concatenate(self.costs)
+        starts = np.bincount(owners, minlength=len(self.x0))
+        table = np.full((len(self.x0), max(starts, default=0)), np.inf)
+        order = np.argsort(owners, kind="stable")
+        column = np.arange(len(owners)) - np.repeat(np.cumsum(starts) - starts, starts)
+        table[owners[order], column] = costs[order]
+        return starts, _hits(table, self.best.cost), _distinct(table)
 
 
 def extend(ddp: DDP, bank: SolutionBank, x0: Array, neighbours: int = 3) -> DDPSolution:
@@ -150,20 +230,17 @@ def better(a: DDPSolution, b: DDPSolution) -> DDPSolution:
     return DDPSolution(**merged)
 
 
-def _from_neighbours(ddp: DDP, best: DDPSolution, x0: Array, neighbours: int) -> tuple[DDPSolution, Array]:
-    bank, costs = SolutionBank.of(ddp, best), []
-    for rows in bank.nearest(x0, count=neighbours + 1).T:
-        solution = ddp.solve(x0, **bank.guess(rows))
-        costs.append(solution.cost)
-        best = better(best, solution)
-    return best, np.column_stack(costs)
+def _improved(former: Array, now: Array) -> NDArray[np.bool_]:
+    finite = np.where(np.isfinite(former), former, 0.0)
+    return np.where(np.isfinite(former), now < finite - IMPROVED * np.abs(finite), np.isfinite(now))
 
 
 def _hits(costs: Array, best: Array) -> NDArray[np.int64]:
-    return (costs <= best[:, None] + SAME * np.abs(best[:, None])).sum(axis=1)
+    near = costs <= (best + np.maximum(SAME * np.abs(best), TINY))[:, None]
+    return (near & np.isfinite(costs)).sum(axis=1)
 
 
 def _distinct(costs: Array) -> NDArray[np.int64]:
     ordered = np.sort(np.where(np.isfinite(costs), costs, np.nan), axis=1)  # NaN last, never apart from anything
-    apart = np.diff(ordered, axis=1) > SAME * np.abs(ordered[:, 1:])
+    apart = np.diff(ordered, axis=1) > np.maximum(SAME * np.abs(ordered[:, 1:]), TINY)
     return np.isfinite(ordered[:, 0]).astype(np.int64) + apart.sum(axis=1)

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from nocl.sysid import LearnedDynamics
 
 Rows = NDArray[np.int64]  # problem numbers
+GROWTH, DECAY = 4.0, 2.0  # of mu, after a failure and a success: against 8 and 8, twice as many wild starts converge
 
 
 @dataclass(frozen=True)
@@ -236,11 +237,11 @@ class _Work:
 
     def _damp(self, rows: Rows) -> None:
         s = self.ddp.settings
-        self.mu[rows] = np.maximum(8 * self.mu[rows], s.damping)
+        self.mu[rows] = np.maximum(GROWTH * self.mu[rows], s.damping)
         self.state[rows[self.mu[rows] > s.largest_damping]] = NO_DESCENT
 
     def _relax(self, rows: Rows) -> None:
-        mu = self.mu[rows] / 8
+        mu = self.mu[rows] / DECAY
         self.mu[rows] = np.where(mu < self.ddp.settings.damping, 0.0, mu)
 
     def solution(self, curvature: bool) -> DDPSolution:

@@ -1,4 +1,4 @@
-"""Batched DDP: Riccati's answer on LQ problems, finite differences and NMPC's optimum elsewhere, failures one by one."""
+"""Batched DDP: Riccati's answer on LQ problems, elsewhere finite differences, NMPC's optimum; failures one by one."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -58,7 +58,7 @@ def riccati(A, B, R, P, T, K):
     """Cost-to-go x'S x and gains of K RK4 steps of xdot = A x + B u, cost int u'R u + x(T)'P x(T), in numpy."""
     n, m, h = len(A), B.shape[1], T / K
     M = np.block([[A, B], [np.zeros((m, n + m))]])  # z = (x, u), u held
-    step = sum(np.linalg.matrix_power(M * h, i) / np.prod(range(1, i + 1)) for i in range(5))
+    step = np.sum([np.linalg.matrix_power(M * h, i) / np.prod(range(1, i + 1)) for i in range(5)], axis=0)
     F, G = step[:n, :n], step[:n, n:]
     S, gains = [P], []
     for _ in range(K):
@@ -141,8 +141,11 @@ def test_optimum_is_nmpcs(name):
         guess = s.u[i] + 1e-3 * np.random.default_rng(i).standard_normal(s.u[i].shape)
         other = nmpc.solve(s.x[i, 0], guess[None], t0=s.t[i, 0])
         assert other.success[0]
-        assert abs(other.cost[0] - s.cost[i]) < 1e-6 * abs(s.cost[i])
-        assert np.abs(other.costate[0, 0] - s.V_x[i, 0]).max() < 1e-4 * (1e-2 + np.abs(s.V_x[i, 0]).max())
+        ours = s[i:i + 1]
+        if name == "dubins":  # from the same guess they may pass the obstacle on different sides
+            ours = solver(name).solve(s.x[i, 0], s.t[i, 0], u=other.u)
+        assert abs(other.cost[0] - ours.cost[0]) < 1e-6 * abs(ours.cost[0])
+        assert np.abs(other.costate[0, 0] - ours.V_x[0, 0]).max() < 1e-4 * (1e-2 + np.abs(ours.V_x[0, 0]).max())
 
 
 def gradient(ocp, K):
@@ -150,7 +153,7 @@ def gradient(ocp, K):
     x, u, h = ca.SX.sym("x", ocp.system.nx), ca.SX.sym("u", ocp.system.nu), ca.SX.sym("h")
     step = ca.Function("step", [x, u, h], list(rk4_cost(ocp.system.f, ocp.L_soft, x, u, h)))
     x0, U, H = ca.MX.sym("x0", ocp.system.nx), ca.MX.sym("U", ocp.system.nu, K), ca.MX.sym("h")
-    cost, state = 0, x0
+    cost, state = ca.MX(0), x0
     for k in range(K):
         state, c = step(state, U[:, k], H)
         cost += c
@@ -267,7 +270,7 @@ def test_cost_units_do_not_change_the_answer():
 def test_wrong_input_is_refused_before_any_work():
     solve = solver("pendulum").solve
     ocp = problem("pendulum")
-    for x0, t0, text in [([1.0, 2.0, 3.0], 0.0, r"x0 has shape \(3,\)"), ([[np.nan, 0.0]], 0.0, "expected finite numbers"),
+    for x0, t0, text in [([1.0, 2.0, 3.0], 0.0, r"x0 has shape \(3,\)"), ([[np.nan, 0.0]], 0.0, "finite numbers"),
                          ([1.0, 0.0], 3.0, r"t0\[0\] is 3.0; expected 0 <= t0 < horizon"), ([1.0, 0.0], -0.1, "t0"),
                          ([1.0, 0.0], np.nan, "t0"), ([1.0, 0.0], [0.0, 1.0], r"t0 has shape \(2,\)")]:
         with pytest.raises(ValueError, match=text):

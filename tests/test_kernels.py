@@ -72,8 +72,8 @@ def test_every_operation_equals_casadis_on_its_domain(tmp_path):
 def test_special_values_as_casadi_has_them(tmp_path):
     outputs = [ca.SX(np.inf) + 0 * A, ca.fmin(A, -np.inf), ca.fmax(A, B), ca.sign(A), ca.if_else(A > B, A, ca.log(B)),
                A**2, A**3, ca.fabs(A), ca.exp(A), ca.sqrt(A), ca.logic_not(A), 1 / B]
-    x = np.array([[-np.inf, 1.0], [np.inf, 2.0], [np.nan, 3.0], [0.0, -0.0], [-2.0, 0.0], [800.0, -800.0], [1e-320, 2.0],
-                  [-1.0, np.nan]])
+    x = np.array([[-np.inf, 1.0], [np.inf, 2.0], [np.nan, 3.0], [0.0, -0.0], [-2.0, 0.0], [800.0, -800.0],
+                  [1e-320, 2.0], [-1.0, np.nan]])
     with np.errstate(all="ignore"):
         expected = ca.Function("f", [X], [ca.vertcat(*outputs)])(x.T).full().T
     np.testing.assert_allclose(run(Kernel(source(outputs), tmp_path), x, len(outputs)), expected, rtol=1e-12)
