@@ -129,8 +129,8 @@ def expression(value: Any, rows: int, allowed: ca.SX, name: str, owner: str, con
         raise ValueError(f"{owner}: {name} has shape {value.shape}, expected ({rows}, 1): "
                          f"{'one row per state, by ca.vertcat(...)' if rows > 1 else 'a scalar expression'}")
     if COPYSIGN_WRONG and _uses(value, ca.OP_COPYSIGN):
-        raise ValueError(f"{owner}: {name} contains copysign, which CasADi {ca.CasadiMeta.version()} differentiates wrongly: "
-                         f"install CasADi 3.8.2 or later, or write it by if_else")
+        raise ValueError(f"{owner}: {name} contains copysign, which CasADi {ca.CasadiMeta.version()} differentiates "
+                         f"wrongly: install CasADi 3.8.2 or later, or write it by if_else")
     free = [s for s in ca.symvar(value) if not ca.depends_on(s, allowed)]
     used = [s.name() for s in free if controls is not None and ca.depends_on(s, controls)]
     if used:
