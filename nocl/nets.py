@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import casadi as ca
 import torch
@@ -30,7 +31,7 @@ class MLP(nn.Module):
             raise ValueError(f"activation is {activation!r}; expected one of {', '.join(ACTIVATIONS)}")
         self.sizes, self.activation = tuple(sizes), activation
         layers: list[nn.Module] = []
-        for n_in, n_out in zip(sizes[:-2], sizes[1:-1], strict=True):
+        for n_in, n_out in pairwise(sizes[:-1]):
             layers += [nn.Linear(n_in, n_out), ACTIVATIONS[activation]()]
         self.body = nn.Sequential(*layers, nn.Linear(sizes[-2], sizes[-1]))
         self.skip = nn.Linear(sizes[0], sizes[-1], bias=False) if skip else None
