@@ -22,10 +22,11 @@ from nocl.data import Solution, Trajectory
 from nocl.ocp import OCP
 from nocl.simulate import dynamics_function
 from nocl.solvers import guesses as starting
+from nocl.solvers.compiled import fingerprint, folder_of, target
 from nocl.solvers.guesses import Guess
 from nocl.solvers.loop import Loop
 from nocl.solvers.lqr import LQR
-from nocl.solvers.pool import Journal, Pool, do, fingerprint
+from nocl.solvers.pool import Journal, Pool, do
 from nocl.solvers.search import TINY, Outcome, Search, Task, attempt
 from nocl.solvers.sensitivity import dense, second_variation
 from nocl.solvers.transcription import BACKENDS, Transcription
@@ -55,6 +56,8 @@ class NMPC:
     constraints : "hard": path constraints at the nodes; "soft": the penalty of ocp.L_soft in the cost instead
     seed : of the random starts
     options : of the nlpsol, like {"ipopt.tol": 1e-6}
+    compiled : compile the program by gcc, once: into the folder that is named here, or for True into that of the
+        environment's NOCL_CACHE (without it: for as long as the process lives); later constructions load it from there
 
     A second NMPC of an equal problem with equal settings uses the program that the first one built.
     """
@@ -72,6 +75,7 @@ class NMPC:
     constraints: str = field(default="hard", kw_only=True)
     seed: int = field(default=0, kw_only=True)
     options: Mapping[str, Any] | None = field(default=None, kw_only=True)
+    compiled: bool | str | os.PathLike[str] = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
         for name, least in (("intervals", 2), ("substeps", 1), ("starts", 1), ("passes", 0), ("neighbours", 1)):
@@ -83,6 +87,8 @@ class NMPC:
         if self.solver not in BACKENDS and not ca.has_nlpsol(self.solver):
             raise ValueError(f"NMPC: solver is {self.solver!r}; expected {' or '.join(BACKENDS)}, or an nlpsol "
                              "that this CasADi has")
+        if self.compiled == "" or not isinstance(self.compiled, (bool, str, os.PathLike)):
+            raise ValueError(f"NMPC: compiled is {self.compiled!r}; expected True, False, or a folder")
         if checks.number(self.window, "horizon", "NMPC", positive=True) > self.ocp.horizon:
             raise ValueError(f"NMPC: horizon is {self.horizon!r}; expected at most {self.ocp.horizon:g}, the OCP's")
         if self.dynamics is not None:
@@ -108,7 +114,8 @@ class NMPC:
     @cached_property
     def program(self) -> Transcription:
         """The nonlinear program, built once for each problem and settings."""
-        return _program(_Recipe(self.key, self))
+        where = "" if self.compiled is False else folder_of(self.compiled)
+        return _program(_Recipe(self.key + where, self))
 
     def solve(self, x0: ArrayLike, guesses: Any = None, *, t0: float = 0.0, nodes: ArrayLike | None = None,
               starts: int | None = None, gains: bool = False, workers: int | str = "auto",
@@ -202,7 +209,8 @@ class _Recipe:
 def _program(recipe: _Recipe) -> Transcription:
     m = recipe.nmpc
     return Transcription(m.ocp, dynamics_function(m.ocp, m.dynamics), int(m.intervals), int(m.substeps),
-                         m.constraints == "soft", m.solver, tuple(sorted((m.options or {}).items())), m.terminal)
+                         m.constraints == "soft", m.solver, tuple(sorted((m.options or {}).items())), m.terminal,
+                         None if m.compiled is False else target(folder_of(m.compiled), m.key))
 
 
 @lru_cache(maxsize=KEPT)

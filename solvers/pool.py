@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import pickle
@@ -196,13 +195,3 @@ def do(job: Any, tasks: Sequence[Task], pool: Pool, journal: Journal, show: bool
             done[outcome.name] = outcome
             bar.update()
     return [done[task.name] for task in tasks]
-
-
-def fingerprint(*parts: Any) -> str:
-    """A hash of bytes, strings, numbers and arrays."""
-    total = hashlib.sha256()
-    for part in parts:
-        data = part if isinstance(part, bytes) else np.ascontiguousarray(part).tobytes() if isinstance(
-            part, np.ndarray) else repr(part).encode()
-        total.update(f"{len(data)}:".encode() + data)
-    return total.hexdigest()[:32]

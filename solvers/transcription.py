@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -18,6 +19,7 @@ import numpy as np
 from nocl.checks import Array
 from nocl.integrate import rk4_cost, rk4_interval
 from nocl.ocp import OCP
+from nocl.solvers.compiled import build
 
 BACKENDS: dict[str, dict[str, Any]] = {
     "ipopt": {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-9, "ipopt.max_iter": 500},
@@ -52,6 +54,7 @@ class Transcription:
     backend: str = "ipopt"
     options: tuple[tuple[str, Any], ...] = ()
     terminal: ca.Function | None = None  # (x) or (x, t) -> cost at the last node; default: G
+    library: Path | None = None  # of compiled functions, built where it is missing; default: none, CasADi interprets
 
     @property
     def L(self) -> ca.Function:
@@ -119,14 +122,21 @@ class Transcription:
     @cached_property
     def solver(self) -> ca.Function:
         """The nlpsol, with exact Hessians."""
+        if self.library is None:
+            return self._nlpsol(self.program, {"expand": self.expandable})
+        if not self.library.exists():
+            build(self._nlpsol(self.program, {}), self.library)  # not expanded: loops over the intervals stay loops
+        return self._nlpsol(str(self.library), {})
+
+    def _nlpsol(self, problem: Any, options: dict[str, Any]) -> ca.Function:
         s, N, m = self.ocp.system, self.N, self.n_path
-        options: dict[str, Any] = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False,
-                                   "expand": self.expandable, **BACKENDS.get(self.backend, {})}
+        options = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False, **options,
+                   **BACKENDS.get(self.backend, {})}
         if self.backend == "fatrop":
             options |= {"structure_detection": "manual", "N": N, "nx": [s.nx] * (N + 1), "nu": [s.nu] * N + [0],
                         "ng": [s.nx] + [m] * N}
         try:
-            return ca.nlpsol("nmpc", self.backend, self.program, {**options, **dict(self.options)})
+            return ca.nlpsol("nmpc", self.backend, problem, {**options, **dict(self.options)})
         except RuntimeError as error:
             reason = str(error).strip().splitlines()[-1]
             raise ValueError(f"NMPC: {self.backend} could not be built with options {dict(self.options)}: {reason}; "
@@ -176,7 +186,7 @@ class Transcription:
     @cached_property
     def second(self) -> Transcription:
         """The same program for IPOPT, which tells an infeasible problem from an unfinished solve."""
-        return replace(self, backend="ipopt", options=())
+        return replace(self, backend="ipopt", options=(), library=None)
 
     def violation(self, g: Array, t: Array) -> tuple[float, str]:
         """(largest violation of a constraint, which one: what, state, node, time)."""

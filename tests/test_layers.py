@@ -12,7 +12,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = {"systems": "nocl.systems", "solvers": "nocl.solvers", "comparisons": "nocl.comparisons"}
 CHAIN = ["lqr", "nmpc", "ddp", "cnd"]  # a solver may use those before it
 # files that are part of a link of the chain
-PARTS = {**dict.fromkeys(("transcription", "guesses", "search", "pool", "sensitivity", "loop"), "nmpc"),
+PARTS = {**dict.fromkeys(("transcription", "guesses", "search", "pool", "sensitivity", "loop", "compiled"), "nmpc"),
          "ddp_kernel": "ddp", "bank": "ddp"}
 MAY_IMPORT = {"core": {"core"}, "systems": {"core", "systems"}, "solvers": {"core", "solvers"},
               "comparisons": {"core", "systems", "solvers", "comparisons"},
