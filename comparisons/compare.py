@@ -30,7 +30,8 @@ from nocl.ocp import OCP
 from nocl.simulate import Simulation, policy_function, simulate
 
 SAMPLED = 80  # intervals that a plain callable is held on
-CALLS = 20  # control evaluations that are timed at each initial state; the median counts
+CALLS = 20  # control evaluations that are timed at each initial state, at most; the median counts
+TIMED = 100.0  # milliseconds spent on that, about
 CHUNKS = 20  # parts that the states are judged in, for the progress bar
 
 
@@ -95,7 +96,7 @@ def _plans(ocp: OCP, name: str, method: Any, x0: Array, hold: int | None) -> Ite
     """One plan, or two for a feedback that is to be held as well; ValueError for what is no method."""
     if isinstance(method, Solution):
         _check_solution(ocp, name, method, x0)
-        yield _Plan(name, lambda x0, progress: _open_loop(ocp, [method], x0, progress, name))
+        yield _Plan(name, lambda x0, progress: _open_loop(ocp, [(method, np.nan)], x0, progress, name))
         return
     policy = _policy(ocp, name, method)
     if policy is not None:
@@ -106,10 +107,16 @@ def _plans(ocp: OCP, name: str, method: Any, x0: Array, hold: int | None) -> Ite
     elif hasattr(method, "solve"):
         yield _Plan(name, lambda x0, progress: _open_loop(ocp, _solve(method, x0, progress), x0, progress, name))
     elif callable(method):
-        yield _Plan(name, _feedback(ocp, method, None, hold or SAMPLED, name))
+        yield _Plan(name, _feedback(ocp, method, None, _held_on(method, hold), name))
     else:
         raise ValueError(f"method {name!r} is a {type(method).__name__}; expected a controller with to_casadi(), a "
                          "casadi.Function (x, t) -> u, a solver with solve(x0), a Solution, or a callable (x, t) -> u")
+
+
+def _held_on(method: Any, hold: int | None) -> int:
+    """Intervals for sampled feedback: as asked for, the controller's own (NMPC's loop has a `hold`), or SAMPLED."""
+    own = getattr(method, "hold", None)
+    return hold or (int(own) if own is not None and _is_count(own) else SAMPLED)
 
 
 def _policy(ocp: OCP, name: str, method: Any) -> ca.Function | None:
@@ -129,6 +136,18 @@ def _check_solution(ocp: OCP, name: str, solution: Solution, x0: Array) -> None:
     if away.size:
         raise ValueError(f"method {name!r} solves state {away[0]} from {solution.x[away[0], 0].tolist()}, but the "
                          f"comparison starts it at {x0[away[0]].tolist()}: pass the Solution's x0 to compare")
+    if said := _off_grid(ocp, solution):
+        raise ValueError(f"method {name!r}: {said}")
+
+
+def _off_grid(ocp: OCP, solution: Any) -> str:
+    """What is wrong with a solution's grid for running it in open loop, or ""."""
+    t = np.atleast_2d(solution.t)
+    if np.allclose(t, np.linspace(0.0, ocp.horizon, t.shape[1]), rtol=0, atol=1e-9 * ocp.horizon):
+        return ""
+    steps = np.diff(t)
+    return (f"its grid goes from {t.min():g} to {t.max():g} in steps of {steps.min():.4g} to {steps.max():.4g}; "
+            f"expected equal steps from 0 to the horizon {ocp.horizon:g}: compare it in closed loop, by controller()")
 
 
 def _feedback(ocp: OCP, method: Any, policy: ca.Function | None, hold: int | None,
@@ -138,27 +157,25 @@ def _feedback(ocp: OCP, method: Any, policy: ca.Function | None, hold: int | Non
 
     def run(x0: Array, progress: bool | None) -> Judged:
         simulation = _in_chunks(lambda x: simulate(ocp, controller, x, hold=hold), ocp, x0, progress, name)
-        ms = np.array([_milliseconds(controller, x) for x in x0])
-        return Judged(name, how, simulation, ms, ms.copy(), np.ones(len(x0)), _predicted(method, x0))
+        first, median = np.array([_milliseconds(controller, x) for x in x0]).T
+        return Judged(name, how, simulation, first, median, np.ones(len(x0)), _predicted(method, x0))
 
     return run
 
 
-def _milliseconds(controller: Any, x: Array) -> float:
-    """The median time of one control evaluation at (x, 0); NaN where it raises."""
+def _milliseconds(controller: Any, x: Array) -> tuple[float, float]:
+    """(first, median) time of a control evaluation at (x, 0): the first differs where a controller warm-starts."""
     argument = x if isinstance(controller, ca.Function) else x[None]
-    times = np.empty(CALLS)
+    times: list[float] = []
     try:
-        controller(argument, 0.0)
-        for i in range(CALLS):
+        while len(times) < CALLS and sum(times) < TIMED:
             start = time.perf_counter()
             controller(argument, 0.0)
-            times[i] = time.perf_counter() - start
-            if times[:i + 1].sum() > 0.1:  # a controller that optimises at each call is timed well by a few
-                return 1e3 * float(np.median(times[:i + 1]))
+            times.append(1e3 * (time.perf_counter() - start))
     except Exception:  # whatever a user's controller raises: the judge has its message
-        return np.nan
-    return 1e3 * float(np.median(times))
+        return np.nan, np.nan
+    median = float(np.median(times[1:] or times))
+    return (median if isinstance(controller, ca.Function) else times[0]), median
 
 
 def _predicted(method: Any, x0: Array) -> Array:
@@ -173,20 +190,23 @@ def _predicted(method: Any, x0: Array) -> Array:
     return np.full(len(x0), np.nan)
 
 
-def _solve(solver: Any, x0: Array, progress: bool | None) -> list[Solution | str]:
-    """Solutions of all states at once; where that raises, state by state, what was raised in place of a Solution."""
+def _solve(solver: Any, x0: Array, progress: bool | None) -> list[tuple[Any, float] | str]:
+    """(Solution, seconds a state) of all states at once; where that raises, state by state, what was raised instead."""
     takes = "progress" in inspect.signature(solver.solve).parameters
+    start = time.perf_counter()
     try:
-        return [solver.solve(x0, progress=progress) if takes else solver.solve(x0)]
+        solution = solver.solve(x0, progress=progress) if takes else solver.solve(x0)
     except Exception as error:  # a solver may raise anything: it becomes a row
         if len(x0) == 1:
             return [_said(error)]
-    return [_solve(solver, x[None], progress)[0] for x in x0]
+        return [_solve(solver, x[None], progress)[0] for x in x0]
+    return [(solution, (time.perf_counter() - start) / len(x0))]
 
 
-def _open_loop(ocp: OCP, parts: Sequence[Solution | str], x0: Array, progress: bool | None, name: str) -> Judged:
+def _open_loop(ocp: OCP, parts: Sequence[tuple[Any, float] | str], x0: Array, progress: bool | None,
+               name: str) -> Judged:
     """Judge the controls of solutions that stand in the order of the states; a str is what a solve raised."""
-    K = max((part.u.shape[1] for part in parts if not isinstance(part, str)), default=1)
+    K = max((part[0].u.shape[1] for part in parts if not isinstance(part, str)), default=1)
     message: list[str] = []
     u = np.full((len(x0), K, ocp.system.nu), np.nan)
     ms, predicted, solves = np.full(len(x0), np.nan), np.full(len(x0), np.nan), np.ones(len(x0))
@@ -195,10 +215,13 @@ def _open_loop(ocp: OCP, parts: Sequence[Solution | str], x0: Array, progress: b
         if isinstance(part, str):
             message.append(part)
             continue
-        rows = slice(i, i + len(part.u))
-        u[rows], ms[rows], predicted[rows] = part.u, 1e3 * np.asarray(part.seconds), part.cost
-        solves[rows] = 1 if part.starts is None else np.maximum(part.starts, 1)
-        message += ["" if ok else f"not solved: {said}" for ok, said in zip(part.success, part.message, strict=True)]
+        solution, seconds = part
+        rows = slice(i, i + len(solution.u))
+        u[rows], predicted[rows] = solution.u, solution.cost
+        ms[rows] = 1e3 * np.asarray(getattr(solution, "seconds", seconds))
+        starts = getattr(solution, "starts", None)
+        solves[rows] = 1 if starts is None else np.maximum(starts, 1)
+        message += _unsolved(ocp, solution)
     solved = np.array([not m for m in message])
     simulation = _failed(ocp, message, np.linspace(0.0, ocp.horizon, K + 1))
     if solved.any():
@@ -206,6 +229,13 @@ def _open_loop(ocp: OCP, parts: Sequence[Solution | str], x0: Array, progress: b
         simulation = _put(simulation, run, solved)
     how = f"open loop, held on {K} intervals"
     return Judged(name, how, simulation, ms, np.full(len(x0), np.nan), solves, predicted)
+
+
+def _unsolved(ocp: OCP, solution: Any) -> list[str]:
+    """"" for each state that a solver solved, else why its answer is not judged."""
+    outcome = zip(solution.success, solution.message, strict=True)
+    off_grid = _off_grid(ocp, solution)
+    return [off_grid if ok else f"not solved: {said}" for ok, said in outcome]
 
 
 def _in_chunks(run: Callable[[Any], Simulation], ocp: OCP, rows: Any, progress: bool | None, name: str) -> Simulation:

@@ -75,7 +75,8 @@ def gaps(report: Report) -> Figure:
     for m, judged in enumerate(report.judged):
         known = np.sort(report.gap[m][report.feasible[m] & np.isfinite(report.gap[m])])
         share = 100 * np.arange(1, len(known) + 1) / n
-        ax.step(np.r_[0, known, right], np.r_[0, share, 100 * len(known) / n], where="post", label=judged.name, **look(m))
+        share = np.r_[0, share, 100 * len(known) / n]
+        ax.step(np.r_[0, known, right], share, where="post", label=judged.name, **look(m))
     ax.set_xscale("symlog", linthresh=SMALL_GAP)
     for x, text in ((1, "1 %"), (5, "5 %")):
         ax.axvline(x, color="0.6", linewidth=0.8)

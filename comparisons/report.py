@@ -131,7 +131,7 @@ class Report:
                 "terminal_error_sd": float(s.terminal_error[ok].std()) if ok.any() else math.nan,
                 "control_magnitude": _mean(s.control_magnitude[ok]), "saturation": _mean(s.saturation[ok]),
                 "clearance_min": float(np.min(s.clearance[ok], initial=math.inf)),
-                "ms_first": _mean(j.ms_first), "solves": _mean(j.solves), "ms_per_solve": _mean(j.ms_first / j.solves),
+                "ms_first": _mean(j.ms_first), "solves": _mean(j.solves), "ms_per_solve": _mean(_each_answer(j)),
                 "ms_per_control": _mean(j.ms_per_control)}
 
     def save(self, folder: str | Path) -> Path:
@@ -148,6 +148,12 @@ class Report:
         return "\n".join([what, "", str(self.summary()), "", *NOTE, "", *self.verdict()])
 
     __repr__ = __str__
+
+
+def _each_answer(judged: Judged) -> Array:
+    """[B], milliseconds for one answer: a control of a controller's, or one of the solves of a solver."""
+    feedback = ~np.isnan(judged.ms_per_control)
+    return np.where(feedback, judged.ms_per_control, judged.ms_first / judged.solves)
 
 
 def _mean(values: Array) -> float:

@@ -58,7 +58,7 @@ def is_type_checking(node: ast.AST) -> bool:
 
 
 def layer(name: str) -> str:
-    if name in ("nocl.cli", "nocl.__main__"):
+    if name in ("nocl.cli", "nocl.stages", "nocl.__main__"):
         return "top"
     parts = name.split(".")
     return parts[1] if len(parts) > 1 and parts[1] in PACKAGES else "core"

@@ -1,0 +1,9 @@
+"""`python -m nocl` is `nocl`."""
+
+from __future__ import annotations
+
+import sys
+
+from nocl.cli import main
+
+sys.exit(main())

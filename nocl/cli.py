@@ -1,0 +1,250 @@
+"""The command line. Nothing heavy is imported before the arguments are checked; all output goes under --out."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import traceback
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NoReturn
+
+if TYPE_CHECKING:
+    from nocl.ocp import OCP
+
+METHODS = ("CND", "NMPC", "LQR", "DDP")
+SOLVERS = ("nmpc", "ddp", "lqr")
+FORMS = ("casadi", "l4casadi", "c")
+INTERRUPTED = 130  # 128 + SIGINT, as shells have it
+
+
+class _Parser(argparse.ArgumentParser):
+    """argparse with one line for an error."""
+
+    def error(self, message: str) -> NoReturn:
+        raise ValueError(f"{message} (see {self.prog} --help)")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; 0, or 2 after one line on stderr, or 130 after Ctrl-C."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    try:
+        args = parser().parse_args(words)
+        args.command(args)
+        sys.stdout.flush()
+    except KeyboardInterrupt:
+        print("\nnocl: interrupted; the same command goes on from the last finished step", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:  # `nocl list | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:  # the command line is where all errors end
+        if "--debug" in words:
+            traceback.print_exc()
+        print(f"nocl: error: {_one_line(error)}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _one_line(error: Exception) -> str:
+    text = " ".join(str(error).split())
+    if isinstance(error, ValueError) and text:
+        return text
+    if isinstance(error, ImportError):
+        return f"{text}: install it, or leave out what needs it"
+    if isinstance(error, OSError):
+        return f"{error.filename or ''}: {error.strerror or text}".removeprefix(": ")
+    return f"unexpected {type(error).__name__}: {text or 'no message'} (--debug shows where)"
+
+
+def parser() -> argparse.ArgumentParser:
+    """The commands and their options."""
+    top = _Parser(prog="nocl", description="Neural optimal control: one symbolic problem in, a checked controller out.",
+                  epilog="A problem is the name of one that comes with nocl (`nocl list`), or the path of a Python "
+                         "file that defines `ocp`. All output goes under --out, by default runs/NAME.")
+    top.add_argument("--version", action="version", version=_version())
+    commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
+
+    def command(name: str, run: Callable[[argparse.Namespace], None], text: str) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        sub.set_defaults(command=run)
+        sub.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        return sub
+
+    command("list", _list, "the problems that come with nocl")
+    sub = command("run", _run, "identify, train, export, solve by NMPC, compare and report, in one go")
+    _add(sub, "problem", "out", "seed", "n", "exact", "quick", "intervals", "methods")
+    sub = command("identify", _identify, "learn the dynamics")
+    _add(sub, "problem", "out", "seed", "quick")
+    sub = command("train", _train, "train a controller and a value function, on learned dynamics unless --exact")
+    _add(sub, "problem", "out", "seed", "exact", "quick")
+    sub = command("solve", _solve, "solve the problem from many initial states")
+    _add(sub, "problem", "out", "seed", "n", "intervals")
+    sub.add_argument("--solver", choices=SOLVERS, default="nmpc", help="default: nmpc")
+    sub = command("export", _export, "write a run's controller, value function and dynamics as CasADi files or C")
+    _add(sub, "run")
+    sub.add_argument("--to", choices=FORMS, action="append", help="default: casadi and c; may be given several times")
+    sub.add_argument("--out", metavar="DIR", help="default: RUN/export")
+    sub = command("compare", _compare, "compare a run's controller with other methods, initial state by initial state")
+    _add(sub, "run", "seed", "n", "intervals", "methods")
+    sub.add_argument("--hold", type=_count, metavar="K", help="judge feedback once more, held on K intervals")
+    sub.add_argument("--out", metavar="DIR", help="default: RUN/report")
+    return top
+
+
+def _add(sub: argparse.ArgumentParser, *names: str) -> None:
+    arguments: dict[str, tuple[str, dict[str, Any]]] = {
+        "problem": ("problem", {"metavar": "NAME_OR_FILE", "help": "a problem's name, or a .py file with `ocp`"}),
+        "run": ("run", {"metavar": "RUN", "help": "the folder of a run, like runs/cartpole"}),
+        "out": ("--out", {"metavar": "DIR", "help": "default: runs/NAME"}),
+        "seed": ("--seed", {"type": _seed, "default": 0, "help": "of all that is drawn; default: 0"}),
+        "n": ("--n", {"type": _count, "default": 100, "help": "number of initial states; default: 100"}),
+        "exact": ("--exact", {"action": "store_true", "help": "train on the exact dynamics, not on learned ones"}),
+        "quick": ("--quick", {"action": "store_true", "help": "small budgets: to see whether it works, not how well"}),
+        "intervals": ("--intervals", {"type": _count, "default": 80, "metavar": "N",
+                                      "help": "of NMPC and DDP; default: 80"}),
+        "methods": ("--methods", {"type": _methods, "default": ("CND", "NMPC"), "metavar": "A,B",
+                                  "help": f"of {', '.join(METHODS)}; default: CND,NMPC"})}
+    for name in names:
+        flag, options = arguments[name]
+        sub.add_argument(flag, **options)
+
+
+def _version() -> str:
+    from nocl import __version__
+
+    return f"nocl {__version__}"
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 1")
+    return int(text)
+
+
+def _seed(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 0")
+    return int(text)
+
+
+def _methods(text: str) -> tuple[str, ...]:
+    names = tuple(word.strip().upper() for word in text.split(","))
+    if not set(names) <= set(METHODS) or len(set(names)) < len(names):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a list of different methods of {', '.join(METHODS)}")
+    return names
+
+
+def _list(args: argparse.Namespace) -> None:
+    from nocl.systems import NAMES, load_ocp
+
+    width = max(map(len, NAMES))
+    print(f"{'name'.ljust(width)}  states  controls  horizon  problem")
+    for name in NAMES:
+        ocp = load_ocp(name)
+        s = ocp.system
+        print(f"{name.ljust(width)}  {s.nx:6d}  {s.nu:8d}  {ocp.horizon:7g}  {_about(name)}")
+
+
+def _about(name: str) -> str:
+    """The first line of a bundled problem's file, without its title."""
+    from importlib import import_module
+
+    first = (import_module(f"nocl.systems.{name}").__doc__ or "").strip().splitlines()[0]
+    return first.partition(": ")[2] or first
+
+
+def _problem(args: argparse.Namespace) -> tuple[OCP, Path]:
+    """The problem and the folder for its output; ValueError before anything is written."""
+    from nocl.systems import load_ocp
+
+    ocp = load_ocp(args.problem)
+    name = Path(args.problem).stem if args.problem.endswith(".py") else args.problem
+    out = Path(args.out) if args.out is not None else Path("runs") / name
+    _check_out(out)
+    return ocp, out
+
+
+def _check_out(out: Path) -> None:
+    """Whether files can be written under `out`, without writing any."""
+    if not str(out).strip() or "\0" in str(out):
+        raise ValueError(f"--out is {str(out)!r}; expected a folder")
+    for path in (out, *out.absolute().parents):
+        if path.exists():
+            if not path.is_dir():
+                raise ValueError(f"{path} is a file; expected a folder for the output: name another --out")
+            if not os.access(path, os.W_OK | os.X_OK):
+                raise ValueError(f"{path} cannot be written to; expected a folder of yours: name another --out")
+            return
+
+
+def _run(args: argparse.Namespace) -> None:
+    from nocl.stages import Stages
+
+    ocp, out = _problem(args)
+    stages = Stages(ocp, out, args.seed, args.quick)
+    stages.check(exact=args.exact)
+    _other_methods(ocp, args.methods, args.intervals)
+    cnd = stages.train(exact=args.exact)
+    stages.export(cnd, out / "export", ("casadi", "c"))
+    stages.compare(cnd, out / "report", args.methods, args.n, args.intervals)
+
+
+def _identify(args: argparse.Namespace) -> None:
+    from nocl.stages import Stages
+
+    ocp, out = _problem(args)
+    stages = Stages(ocp, out, args.seed, args.quick)
+    stages.check(exact=False)
+    stages.identify()
+
+
+def _train(args: argparse.Namespace) -> None:
+    from nocl.stages import Stages
+
+    ocp, out = _problem(args)
+    stages = Stages(ocp, out, args.seed, args.quick)
+    stages.check(exact=args.exact)
+    stages.train(exact=args.exact)
+
+
+def _solve(args: argparse.Namespace) -> None:
+    from nocl.stages import solve
+
+    ocp, out = _problem(args)
+    solve(ocp, out / "solutions", args.solver, args.n, args.seed, args.intervals)
+
+
+def _export(args: argparse.Namespace) -> None:
+    from nocl.stages import Stages, load_run
+
+    run = Path(args.run)
+    cnd = load_run(run)
+    out = Path(args.out) if args.out is not None else run / "export"
+    _check_out(out)
+    Stages(cnd.ocp, run, 0, False).export(cnd, out, tuple(dict.fromkeys(args.to or ("casadi", "c"))))
+
+
+def _compare(args: argparse.Namespace) -> None:
+    from nocl.stages import Stages, load_run
+
+    run = Path(args.run)
+    cnd = load_run(run)
+    out = Path(args.out) if args.out is not None else run / "report"
+    _check_out(out)
+    _other_methods(cnd.ocp, args.methods, args.intervals)
+    Stages(cnd.ocp, run, args.seed, False).compare(cnd, out, args.methods, args.n, args.intervals, args.hold)
+
+
+def _other_methods(ocp: OCP, methods: Sequence[str], intervals: int) -> None:
+    """ValueError for methods that cannot be built for this problem, before long work."""
+    from nocl.stages import method
+
+    for name in methods:
+        if name != "CND":
+            method(ocp, name, intervals)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,233 @@
+"""The main job's stages in a run's folder, for the command line: each is made once, and taken up where it stands.
+
+dynamics/   the learned dynamics                              cnd/      controller and value function
+export/     policy.casadi, value.casadi, dynamics.casadi, c/  report/   report.html, rows.csv, summary.json, figures/
+nmpc/       NMPC's answers so far, so that an interrupted comparison goes on
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import shutil
+import time
+import uuid
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from nocl import store
+from nocl.ocp import OCP
+from nocl.solvers.cnd import CND, TrainSettings, train
+from nocl.sysid import LearnedDynamics, Settings, identify
+
+QUICK_IDENTIFY = Settings(iterations=300, polish=10)
+QUICK_TRAIN = TrainSettings(seeds=6, starts=6, states=60, tails=300, visits=200, rounds=1, iterations=400,
+                            value_tails=400, value_iterations=300, held_out=16)
+PARTS = ("dynamics", "cnd", "export", "nmpc", "report", "checkpoint")  # folders in a run's folder
+KEY = "run"  # of a card: what the stage was made from
+
+
+@dataclass(frozen=True)
+class Stages:
+    """The stages of one problem in one folder; what was made with other settings there is made anew, and said so."""
+
+    ocp: OCP
+    folder: Path
+    seed: int
+    quick: bool
+
+    def check(self, exact: bool) -> None:
+        """ValueError where the folder holds something that is not a run's, before any work."""
+        for part in PARTS:
+            if (self.folder / part).exists() and not (self.folder / part).is_dir():
+                raise ValueError(f"{self.folder / part} is a file; expected a run's folder: name another --out")
+        if not exact:
+            self._dynamics_there()
+        self._cnd_there()
+
+    def identify(self) -> LearnedDynamics:
+        """The learned dynamics, in dynamics/."""
+        made_from, there = self._made_from(), self._dynamics_there()
+        if there is not None and there.card.get(KEY) == made_from:
+            say(f"dynamics: taken from {self.folder / 'dynamics'} ({there.card.get('score', '')})")
+            return there
+        say(f"dynamics: learning f of {self.ocp.system.name}" + _anew(there))
+        start = time.perf_counter()
+        checkpoint = self.folder / "checkpoint" / "dynamics"
+        model = identify(self.ocp.system, seed=self.seed, settings=QUICK_IDENTIFY if self.quick else None,
+                         checkpoint=checkpoint)
+        model = replace(model, card={**model.card, KEY: made_from})
+        model.save(self.folder / "dynamics")
+        _forget(checkpoint)
+        say(f"dynamics: {model.card.get('score', 'done')}, {time.perf_counter() - start:.0f} s")
+        return model
+
+    def train(self, exact: bool) -> CND:
+        """The controller and value function, in cnd/; on dynamics/ unless exact."""
+        model = None if exact else self.identify()
+        made_from, there = self._made_from(exact=exact), self._cnd_there()
+        if there is not None and there.card.get(KEY) == made_from:
+            say(f"controller: taken from {self.folder / 'cnd'}")
+            return there
+        say(f"controller: training on {'the exact' if exact else 'learned'} dynamics" + _anew(there))
+        start = time.perf_counter()
+        checkpoint = self.folder / "checkpoint" / "cnd"
+        cnd = train(self.ocp, model, seed=self.seed, settings=QUICK_TRAIN if self.quick else None, out=checkpoint)
+        cnd.card[KEY] = made_from
+        cnd.save(self.folder / "cnd")
+        _forget(checkpoint)
+        say(f"controller: done, {time.perf_counter() - start:.0f} s")
+        return cnd
+
+    def export(self, cnd: CND, out: Path, forms: Sequence[str]) -> None:
+        """The controller, the value function and the learned dynamics, where there are any, in each of the forms."""
+        start = time.perf_counter()
+        for form in forms:
+            if form == "c":
+                cnd.to_c(out / "c")
+            else:
+                self._export_casadi(cnd, out, form)
+        say(f"export: {', '.join(forms)} in {out}, {time.perf_counter() - start:.1f} s")
+
+    def _export_casadi(self, cnd: CND, out: Path, form: str) -> None:
+        """L4CasADi's functions call their libraries, which therefore stay beside them."""
+        native, folder = form == "casadi", out if form == "casadi" else out / form
+        backend, build = ("native", None) if native else (form, folder / "lib")
+        save_function(cnd.to_casadi(backend, build), folder / "policy.casadi")
+        if cnd.value_net is not None:
+            save_function(cnd.value_to_casadi(backend, build), folder / "value.casadi")
+        if native and cnd.card.get("dynamics") == "learned" and (model := self._dynamics_there()) is not None:
+            save_function(model.to_casadi(), folder / "dynamics.casadi")
+
+    def compare(self, cnd: CND, out: Path, methods: Sequence[str], n: int, intervals: int,
+                hold: int | None = None) -> None:
+        """Judge the methods on n fresh initial states, save the report and print its summary and verdict."""
+        from nocl.comparisons import compare
+
+        x0 = fresh_states(self.ocp, n, self.seed)
+        chosen: dict[str, Any] = {name: cnd if name == "CND" else method(self.ocp, name, intervals) for name in methods}
+        if "NMPC" in chosen:
+            say(f"NMPC: {n} initial states, {intervals} intervals")
+            chosen["NMPC"] = chosen["NMPC"].solve(x0, out=self.folder / "nmpc")
+        say(f"comparing {', '.join(methods)} on the exact dynamics")
+        report = compare(self.ocp, chosen, n=n, seed=fresh_seed(self.seed), hold=hold)
+        path = report.save(out)
+        say(f"\n{report}\n\nreport: {path}")
+
+    def _made_from(self, **settings: Any) -> dict[str, Any]:
+        problem = hashlib.sha256(json.dumps(self.ocp.to_data(), sort_keys=True).encode()).hexdigest()
+        return {"problem": problem, "seed": self.seed, "quick": self.quick, **settings}
+
+    def _dynamics_there(self) -> LearnedDynamics | None:
+        folder = self.folder / "dynamics"
+        return _ours(LearnedDynamics.load(folder), folder) if _has_record(folder) else None
+
+    def _cnd_there(self) -> CND | None:
+        folder = self.folder / "cnd"
+        return _ours(CND.load(folder), folder) if _has_record(folder) else None
+
+
+def _has_record(folder: Path) -> bool:
+    return folder.exists() and (not folder.is_dir() or any(folder.glob("*" + store.SUFFIX)))
+
+
+def _ours(thing: Any, folder: Path) -> Any:
+    if KEY not in thing.card:
+        raise ValueError(f"{folder} holds what `nocl run` did not make, and would be overwritten; expected a folder of "
+                         "a run: name another --out")
+    return thing
+
+
+def _anew(there: Any) -> str:
+    """Why something that stands there is made again."""
+    return "" if there is None else " (what is there was made for another problem, seed or setting)"
+
+
+def _forget(checkpoint: Path) -> None:
+    """Remove the checkpoint of a finished stage."""
+    shutil.rmtree(checkpoint, ignore_errors=True)
+    if checkpoint.parent.is_dir() and not any(checkpoint.parent.iterdir()):
+        checkpoint.parent.rmdir()
+
+
+def say(text: str) -> None:
+    """A line for the user, at once."""
+    print(text, flush=True)
+
+
+def fresh_seed(seed: int) -> int:
+    """The seed of the initial states that methods are compared on: not the one that training draws from."""
+    return seed + 1
+
+
+def fresh_states(ocp: OCP, n: int, seed: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """The initial states [n, nx] that methods are compared on."""
+    return ocp.initial_states.sample(n, fresh_seed(seed))
+
+
+def load_run(folder: Path) -> CND:
+    """The controller of a run's folder, or of a folder that CND.save wrote."""
+    if not folder.is_dir():
+        raise ValueError(f"there is no folder {folder}; expected one that `nocl run` or `nocl train` made")
+    return CND.load(folder / "cnd" if (folder / "cnd").is_dir() else folder)
+
+
+def method(ocp: OCP, name: str, intervals: int) -> Any:
+    """A method of the comparison other than CND, by name."""
+    from nocl import solvers
+
+    match name.upper():
+        case "NMPC":
+            return solvers.NMPC(ocp, intervals=intervals)
+        case "DDP":
+            return solvers.DDP(ocp, intervals=intervals)
+        case "LQR":
+            return solvers.LQR(ocp)
+    raise ValueError(f"method is {name!r}; expected NMPC, DDP or LQR")
+
+
+def solve(ocp: OCP, out: Path, name: str, n: int, seed: int, intervals: int) -> None:
+    """Solve n initial states by one solver, and write OUT/NAME.npz (arrays), .json (messages) and a line of summary."""
+    from nocl.simulate import simulate
+
+    solver, x0 = method(ocp, name, intervals), fresh_states(ocp, n, seed)
+    start = time.perf_counter()
+    if name == "lqr":
+        s = simulate(ocp, solver, x0)
+        arrays = {"t": s.t, "x": s.x, "u": s.u, "cost": s.cost, "success": s.success}
+        message = s.message
+    else:
+        solution = solver.solve(x0)
+        arrays = {"t": solution.t, "x": solution.x, "u": solution.u, "cost": solution.cost, "success": solution.success,
+                  "costate": solution.costate if hasattr(solution, "costate") else solution.V_x}
+        message = solution.message
+    path = _write_arrays(out / f"{name}.npz", {"x0": x0, **arrays})
+    store.write_json(out / f"{name}.json", {"solver": name, "n": n, "seed": fresh_seed(seed), "message": list(message)})
+    ok = arrays["success"]
+    mean = f", mean cost {arrays['cost'][ok].mean():.4g}" if ok.any() else ""
+    say(f"{name}: {ok.sum()} of {n} solved{mean}, {time.perf_counter() - start:.1f} s\n{path}")
+
+
+def _write_arrays(path: Path, arrays: dict[str, Any]) -> Path:
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays)
+    return store.write_bytes(path, file.getvalue())
+
+
+def save_function(function: ca.Function, path: Path) -> Path:
+    """Write a .casadi file atomically; it loads by ca.Function.load in the same or a newer CasADi."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.part")
+    try:
+        function.save(str(part))
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
+    return path
