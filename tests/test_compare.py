@@ -1,0 +1,219 @@
+"""compare: gaps against a known optimum, one row for every method and state, the same states for all, no lost failure."""
+
+import dataclasses
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import nocl
+from nocl.comparisons import compare
+from nocl.comparisons.report import percentile
+from nocl.data import Solution, Trajectory
+from nocl.solvers import LQR, NMPC
+from nocl.systems import double_integrator, dubins
+
+N = 6
+
+
+def riccati_cost(x0, T=2.0, R=0.01):
+    """x0' S(0) x0 of double_integrator.ocp's docstring, in numpy."""
+    W = np.array([[T**3 / 3, T**2 / 2], [T**2 / 2, T]]) / R
+    Phi = np.array([[1.0, T], [0.0, 1.0]])
+    return np.einsum("bi,ij,bj->b", x0, Phi.T @ np.linalg.inv(np.eye(2) + W) @ Phi, x0)
+
+
+def nothing(x, t=0.0):
+    return np.zeros((len(x), 1))
+
+
+@pytest.fixture(scope="module")
+def ocp():
+    return double_integrator.ocp()
+
+
+@pytest.fixture(scope="module")
+def report(ocp):
+    methods = {"LQR": LQR(ocp), "NMPC": NMPC(ocp, intervals=20, starts=1, passes=0), "nothing": nothing}
+    return compare(ocp, methods, n=N, seed=3, hold=40, progress=False)
+
+
+def test_costs_and_gaps_are_those_of_the_known_optimum(ocp, report):
+    optimum = riccati_cost(ocp.initial_states.sample(N, 3))
+    rows = {(row["method"], row["state"]): row for row in report.rows()}
+    for i, best in enumerate(optimum):
+        assert rows["LQR", i]["cost"] == pytest.approx(best, rel=1e-7)
+        assert rows["LQR", i]["gap"] == pytest.approx(0, abs=1e-5)
+        assert rows["nothing", i]["gap"] == pytest.approx(100 * (rows["nothing", i]["cost"] / best - 1), rel=1e-6)
+        assert {rows[name, i]["best_method"] for name in ("LQR", "NMPC", "nothing")} == {"LQR"}
+        assert 0 < rows["NMPC", i]["gap"] < 5
+        assert rows["NMPC", i]["predicted_cost"] == pytest.approx(rows["NMPC", i]["cost"], rel=1e-6)
+
+
+def test_there_is_a_row_for_each_method_and_state_from_the_same_states(ocp, report):
+    names = ["LQR", "LQR (40 holds)", "NMPC", "nothing"]
+    assert [(row["method"], row["state"]) for row in report.rows()] == [(m, i) for m in names for i in range(N)]
+    x0 = ocp.initial_states.sample(N, 3)
+    for judged in report.judged:
+        np.testing.assert_array_equal(judged.simulation.x[:, 0], x0)
+    for row in report.rows():
+        assert row["x0"] == x0[row["state"]].tolist()
+
+
+def test_a_held_feedback_costs_a_little_more(report):
+    cost = {row["method"]: row["cost_mean"] for row in report.summary()}
+    assert cost["LQR"] < cost["LQR (40 holds)"] < cost["LQR"] * 1.02
+
+
+def test_summary(report):
+    summary = {row["method"]: row for row in report.summary()}
+    assert summary["LQR"]["within_1"] == summary["LQR"]["within_5"] == 100
+    assert summary["LQR"]["found_best"] == N
+    assert summary["nothing"]["within_5"] == 0
+    assert all(row["failures"] == row["violations"] == 0 for row in summary.values())
+    assert summary["LQR"]["how"] == "continuous feedback"
+    assert summary["NMPC"]["how"] == "open loop, held on 20 intervals"
+    assert np.isnan(summary["NMPC"]["ms_per_control"])
+    assert summary["NMPC"]["ms_first"] > 0 < summary["LQR"]["ms_per_control"]
+    text = str(report.summary())
+    assert all(name in text for name in summary)
+    assert "LQR on all 6" in report.verdict()[0]
+
+
+def test_the_report_is_frozen(report):
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        report.x0 = None
+
+
+def far(x, t=0.0):
+    if (x[:, 0] > 1.0).any() and t > 1.0:
+        raise RuntimeError("too far\nto the right")
+    return np.zeros((len(x), 1))
+
+
+def test_a_controller_that_raises_or_blows_up_has_rows_that_say_so(ocp):
+    x0 = [[0.9, 0.0], [1.1, 0.0], [0.8, 0.0]]
+    nan = lambda x, t: np.where(x[:, :1] > 0.85, np.nan, 0.0)  # noqa: E731
+    report = compare(ocp, {"LQR": LQR(ocp), "far": far, "NaN": nan}, x0=x0, progress=False)
+    rows = {(row["method"], row["state"]): row for row in report.rows()}
+    assert [rows["far", i]["success"] for i in range(3)] == [True, False, True]
+    assert rows["far", 1]["message"] == "RuntimeError: too far to the right"
+    assert rows["far", 1]["cost"] == rows["far", 1]["gap"] == np.inf
+    assert [rows["NaN", i]["success"] for i in range(3)] == [False, False, True]
+    assert "NaN" in rows["NaN", 0]["message"]
+    summary = {row["method"]: row for row in report.summary()}
+    assert (summary["far"]["failures"], summary["NaN"]["failures"]) == (1, 2)
+    assert summary["far"]["gap_p95"] == np.inf
+    assert summary["far"]["cost_mean"] == pytest.approx((0.9**2 + 0.8**2) / 2, rel=1e-6)
+    assert "far failed on 1 of 3" in report.verdict()[-1]
+
+
+class Fragile:
+    """A solver that gives up on some states, and raises on others."""
+
+    def solve(self, x0):
+        if (x0[:, 0] > 1.0).any():
+            raise RuntimeError("no memory")
+        B = len(x0)
+        x = np.repeat(x0[:, None], 5, axis=1)
+        return Solution(Trajectory(np.linspace(0, 2, 5), x, np.zeros((B, 4, 1))), cost=np.full(B, 0.5), costate=x,
+                        success=x0[:, 0] > 0.85, message=["too near" if p <= 0.85 else "" for p in x0[:, 0]],
+                        seconds=np.full(B, 0.25), iterations=np.full(B, 3), starts=np.full(B, 5))
+
+
+def test_a_solver_that_fails_on_some_states_keeps_the_others(ocp):
+    report = compare(ocp, {"fragile": Fragile()}, x0=[[0.9, 0.0], [1.1, 0.0], [0.8, 0.0]], progress=False)
+    ok, raised, gave_up = report.rows()
+    assert ok["success"]
+    assert ok["cost"] == pytest.approx(0.81, rel=1e-9)
+    assert ok["predicted_cost"] == 0.5
+    assert ok["ms_first"] == 250
+    assert (raised["success"], raised["message"]) == (False, "RuntimeError: no memory")
+    assert (gave_up["success"], gave_up["message"], gave_up["cost"]) == (False, "not solved: too near", np.inf)
+    assert report.summary()[0]["within_5"] == pytest.approx(100 / 3)
+    assert raised["best_method"] == ""
+    assert np.isnan(raised["best_cost"])
+
+
+def test_a_run_that_violates_a_constraint_is_never_the_best():
+    ocp = dubins.ocp()
+    x0 = [[-2.5, 0.0, 0.0]]  # straight ahead stands the obstacle
+    straight, slow = (lambda x, t, v=v: np.tile([v, 0.0], (len(x), 1)) for v in (0.32, 0.1))
+    report = compare(ocp, {"through": straight, "short of it": slow}, x0=x0, progress=False)
+    through, short = report.rows()
+    assert through["cost"] < short["cost"]
+    assert through["clearance"] < 0 < short["clearance"]
+    assert (through["feasible"], short["feasible"]) == (False, True)
+    assert through["best_method"] == short["best_method"] == "short of it"
+    assert through["gap"] < 0
+    assert [row["within_5"] for row in report.summary()] == [0, 100]
+    assert [row["violations"] for row in report.summary()] == [1, 0]
+    assert "through violates a path constraint on 1 of 1" in report.verdict()[-1]
+
+
+def test_a_solution_is_judged_as_it_is(ocp):
+    x0 = ocp.initial_states.sample(3, 1)
+    solution = NMPC(ocp, intervals=20, starts=1, passes=0).solve(x0)
+    report = compare(ocp, {"plan": solution}, x0=x0, progress=False)
+    np.testing.assert_allclose(report.cost[0], solution.cost, rtol=1e-6)
+    with pytest.raises(ValueError, match="the comparison starts it at"):
+        compare(ocp, {"plan": solution}, x0=x0[::-1], progress=False)
+    with pytest.raises(ValueError, match="one solution for each of the 2 initial states"):
+        compare(ocp, {"plan": solution}, x0=x0[:2], progress=False)
+
+
+def test_a_plan_on_another_grid_is_refused(ocp):
+    x0 = ocp.initial_states.sample(2, 1)
+    late = NMPC(ocp, intervals=20, starts=1, passes=0).solve(x0, t0=1.0)
+    with pytest.raises(ValueError, match="equal steps from 0 to the horizon"):
+        compare(ocp, {"late": late}, x0=x0, progress=False)
+
+
+def test_nmpc_in_closed_loop_is_sampled_at_its_own_rate(ocp):
+    loop = NMPC(ocp, intervals=10, starts=1, passes=0).controller()
+    report = compare(ocp, {"loop": loop}, n=1, progress=False)
+    assert report.judged[0].how == "feedback, held on 10 intervals"
+    assert report.summary()[0]["failures"] == 0
+
+
+def test_casadi_functions_are_methods(ocp):
+    x, t = ca.MX.sym("x", 2), ca.MX.sym("t")
+    policy = ca.Function("policy", [x, t], [-x[0] - x[1]])
+    assert compare(ocp, {"PD": policy}, n=2, progress=False).judged[0].how == "continuous feedback"
+
+
+@pytest.mark.parametrize(("methods", "options", "message"), [
+    ({}, {}, "expected a dict of methods"),
+    ([nothing], {}, "expected a dict of methods"),
+    ({"": nothing}, {}, "expected a printable name"),
+    ({3: nothing}, {}, "expected a printable name"),
+    ({"two": 2}, {}, "method 'two' is a int"),
+    ({"wrong": ca.Function("p", [ca.MX.sym("x", 3), ca.MX.sym("t")], [ca.MX(0)])}, {}, "method 'wrong'"),
+    ({"a": nothing}, {"n": 0}, "n is 0"),
+    ({"a": nothing}, {"n": 2.5}, "n is 2.5"),
+    ({"a": nothing}, {"hold": 0}, "hold is 0"),
+    ({"a": nothing}, {"x0": [[1.0, 2.0, 3.0]]}, "nx = 2"),
+    ({"a": nothing}, {"x0": np.zeros((0, 2))}, "no rows"),
+    ({"a": nothing}, {"x0": [np.nan, 0.0]}, "finite"),
+])
+def test_bad_input_is_told_before_any_work(ocp, methods, options, message):
+    with pytest.raises(ValueError, match=message):
+        compare(ocp, methods, progress=False, **options)
+
+
+def test_a_name_that_a_held_twin_would_take_is_refused(ocp):
+    with pytest.raises(ValueError, match="different names"):
+        compare(ocp, {"LQR": LQR(ocp), "LQR (5 holds)": nothing}, hold=5, progress=False)
+
+
+@pytest.mark.parametrize("values", [[0.0, 1.0, 2.0, np.inf], [0.0, np.inf], [np.inf], [1.0, 2.0]])
+@pytest.mark.parametrize("q", [0, 50, 95, 100])
+def test_percentiles_with_failures_are_never_nan(values, q):
+    value = percentile(np.array(values), q)
+    assert not np.isnan(value)
+    if np.isfinite(values).all():
+        assert value == np.percentile(values, q)
+
+
+def test_the_public_names():
+    assert nocl.comparisons.compare is compare
