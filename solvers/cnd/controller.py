@@ -17,9 +17,11 @@ from nocl import checks, store
 from nocl.checks import Array
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
+from nocl.simulate import dynamics_function
 from nocl.to_casadi import to_casadi
 
 KIND = "cnd"  # the name of its file in a folder
+Build = str | os.PathLike[str] | None  # a folder for what L4CasADi compiles
 
 
 class CND:
@@ -62,13 +64,35 @@ class CND:
         (gradient,) = torch.autograd.grad(self._value_net()(states, times).sum(), states)
         return gradient[0].numpy() if single else gradient.numpy()
 
-    def to_casadi(self, backend: str = "native", build_dir: str | os.PathLike[str] | None = None) -> ca.Function:
+    def to_casadi(self, backend: str = "native", build_dir: Build = None) -> ca.Function:
         """policy:(x [nx], t) -> (u [nu]), a CasADi Function; backend "native" (MX, float64) or "l4casadi" (float32)."""
         return self._export(self.policy, "policy", "u", backend, build_dir)
 
-    def value_to_casadi(self, backend: str = "native", build_dir: str | os.PathLike[str] | None = None) -> ca.Function:
+    def value_to_casadi(self, backend: str = "native", build_dir: Build = None) -> ca.Function:
         """value:(x [nx], t) -> (V) as a CasADi Function."""
         return self._export(self._value_net(), "value", "V", backend, build_dir)
+
+    def value_gradient_to_casadi(self, backend: str = "native", build_dir: Build = None) -> ca.Function:
+        """value_gradient:(x [nx], t) -> (V_x [nx]), the costate, as a CasADi Function."""
+        V = self.value_to_casadi(backend, build_dir)
+        x, t = V.mx_in()
+        return ca.Function("value_gradient", [x, t], [ca.densify(ca.jacobian(V(x, t), x)).T], ["x", "t"], ["V_x"])
+
+    def gain_to_casadi(self, backend: str = "native", build_dir: Build = None) -> ca.Function:
+        """gain:(x [nx], t) -> (K [nu, nx]), the linear feedback du = K dx of the closed loop, K = d pi / dx."""
+        pi = self.to_casadi(backend, build_dir)
+        x, t = pi.mx_in()
+        return ca.Function("gain", [x, t], [ca.densify(ca.jacobian(pi(x, t), x))], ["x", "t"], ["K"])
+
+    def closed_loop_to_casadi(self, dynamics: Any = None, backend: str = "native",
+                              build_dir: Build = None) -> ca.Function:
+        """closed_loop:(x [nx], t) -> (xdot [nx]), xdot = f(x, pi(x, t)).
+
+        dynamics: another f than the exact one, a casadi.Function (x, u) -> xdot or an object with `to_casadi()`.
+        """
+        pi, f = self.to_casadi(backend, build_dir), dynamics_function(self.ocp, dynamics)
+        x, t = pi.mx_in()
+        return ca.Function("closed_loop", [x, t], [ca.densify(f(x, pi(x, t)))], ["x", "t"], ["xdot"])
 
     def to_c(self, folder: str | os.PathLike[str]) -> Path:
         """C99 source, header, test vectors and self-test of the controller in `folder`; returns it."""
@@ -115,8 +139,9 @@ class CND:
                              "train with settings that have value=True")
         return self.value_net
 
-    def _export(self, net: FeatureNet, name: str, out: str, backend: str, build_dir: Any) -> ca.Function:
-        return to_casadi(net, backend=backend, name=name, build_dir=build_dir, in_names=["x", "t"], out_names=[out])
+    def _export(self, net: FeatureNet, name: str, out: str, backend: str, build_dir: Build) -> ca.Function:
+        return to_casadi(net, backend=backend, name=name, build_dir=None if build_dir is None else Path(build_dir),
+                         in_names=["x", "t"], out_names=[out])
 
 
 def pretrained(name: str, dynamics: str = "exact") -> CND:
