@@ -42,8 +42,8 @@ def run(*command: str, cwd=None) -> str:
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
 def test_the_self_test_passes_without_a_warning(tmp_path, dtype):
     folder = to_c(policy(), tmp_path / "c", bounds=BOUNDS, labels=LABELS, dtype=dtype, note="a controller")
-    assert sorted(p.name for p in folder.iterdir()) == ["Makefile", "policy.c", "policy.h", "policy_casadi.c",
-                                                        "policy_test.c", "policy_vectors.csv"]
+    assert sorted(p.name for p in folder.iterdir()) == ["Makefile", "README.md", "policy.c", "policy.h",
+                                                        "policy_casadi.c", "policy_test.c", "policy_vectors.csv"]
     assert [p.name for p in tmp_path.iterdir()] == ["c"]
     run(*STRICT, "policy_test.c", "policy.c", "-o", "a.out", "-lm", cwd=folder)
     assert re.search(r"81 vectors, largest error .*: ok", run("./a.out", cwd=folder))

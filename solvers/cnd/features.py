@@ -23,8 +23,11 @@ DEGREE = 6  # of the polynomials in time
 LEAST_TIME = 0.025  # of the horizon: time to go is never counted as less
 
 
-def features(ocp: OCP, x: Array, t: Array) -> ca.Function:
-    """(x, t) -> phi, each feature with mean 0 and standard deviation 1 over the labels x [n, nx], t [n]."""
+def features(ocp: OCP, x: Array, t: Array, plain: bool = False) -> ca.Function:
+    """(x, t) -> phi, each feature with mean 0 and standard deviation 1 over the labels x [n, nx], t [n].
+
+    `plain` adds the state in units that do not change with time.
+    """
     s, time = ocp.system, ca.SX.sym("t")
     tau = 2 * time / ocp.horizon - 1
     to_go = ca.fmax(ocp.horizon - time, 0)
@@ -33,7 +36,7 @@ def features(ocp: OCP, x: Array, t: Array) -> ca.Function:
     angles = [g(s.x[i]) for i in s.angle_indices for g in (ca.sin, ca.cos)]
     rush = (s.x - ca.DM(ocp.x_goal)) / (to_go + LEAST_TIME * ocp.horizon)
     clock = ca.vertcat(tau, ca.log(to_go / ocp.horizon + LEAST_TIME) / 2)
-    raw = ca.vertcat(standard, *angles, clock, rush)
+    raw = ca.vertcat(standard, *angles, clock, rush, s.x if plain else ca.SX(0, 1))
     some = slice(None, None, -(-len(t) // 20_000))  # of every kind of label
     values = ca.Function("raw", [s.x, time], [raw])(x[some].T, t[None, some]).full()
     centre, width = values.mean(axis=1), values.std(axis=1) + 1e-6
@@ -43,8 +46,8 @@ def features(ocp: OCP, x: Array, t: Array) -> ca.Function:
 def _moments_in_time(x: Array, tau: Array) -> tuple[Array, Array]:
     """Chebyshev coefficients [nx, DEGREE+1] of the mean and of the log standard deviation of x at tau in [-1, 1]."""
     bins = np.clip(((tau + 1) * 10).astype(int), 0, 19)
-    centres = [tau[bins == b].mean() for b in range(20) if (bins == b).sum() > 8]
-    groups = [x[bins == b] for b in range(20) if (bins == b).sum() > 8]
+    filled = [bins == b for b in range(20) if (bins == b).sum() > 8] or [bins >= 0]
+    centres, groups = [tau[b].mean() for b in filled], [x[b] for b in filled]
     floor = 0.05 * x.std(axis=0) + 1e-6
     degree = min(DEGREE, max(len(centres) - 1, 0))
     mean = np.polynomial.chebyshev.chebfit(centres, [g.mean(axis=0) for g in groups], degree)
@@ -69,26 +72,3 @@ def policy_net(ocp: OCP, labels: Labels, sizes: tuple[int, ...]) -> tuple[Featur
     outputs = ca.Function("controls", [s.x, time, y], [clipped], ["x", "t", "y"], ["u"])
     net = FeatureNet(phi, [MLP([phi.numel_out(0), *sizes, s.nu])], outputs)
     return net, ca.Function("inverse", [u], [(u - mean) / spread], ["u"], ["y"])
-
-
-def value_net(ocp: OCP, labels: Labels, sizes: tuple[int, ...]) -> tuple[FeatureNet, ca.Function]:
-    """V of a tanh network y of the features, and V -> y, its inverse.
-
-    Where every label is positive, V = exp(a + b y) - offset, so that y's errors are relative errors of V; otherwise
-    V = a + b y.
-    """
-    s, time = ocp.system, ca.SX.sym("t")
-    phi = features(ocp, labels.node_x, labels.node_t)
-    y, V = ca.SX.sym("y"), ca.SX.sym("V")
-    labelled = labels.V
-    if labelled.min() >= 0:
-        offset = max(0.01 * float(np.median(labelled)), 1e-9)
-        logs = np.log(labelled + offset)
-        a, b = float(logs.mean()), float(logs.std()) + 1e-9
-        forward, inverse = ca.exp(a + b * y) - offset, (ca.log(V + offset) - a) / b
-    else:
-        a, b = float(labelled.mean()), float(labelled.std()) + 1e-9
-        forward, inverse = a + b * y, (V - a) / b
-    outputs = ca.Function("value", [s.x, time, y], [forward], ["x", "t", "y"], ["V"])
-    net = FeatureNet(phi, [MLP([phi.numel_out(0), *sizes, 1])], outputs)
-    return net, ca.Function("inverse", [V], [inverse], ["V"], ["y"])

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from nocl.checks import Array
@@ -21,17 +22,12 @@ Field = Callable[[Tensor, Tensor], Tensor]
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """Controls at the middle of each interval, where a held control equals the continuous one to second order; values
-    at its start."""
+    """Controls at the middle of each interval, where a held control equals the continuous one to second order."""
 
     x: Array  # [n, nx]
     t: Array  # [n]
     u: Array  # [n, nu]
     weight: Array  # [n], the length of the interval
-    node_x: Array  # [n, nx]
-    node_t: Array  # [n]
-    V: Array  # [n]
-    V_x: Array  # [n, nx]
 
     def __len__(self) -> int:
         return len(self.t)
@@ -50,7 +46,7 @@ class Labels:
         with torch.no_grad():
             half = torch.from_numpy(step / 2)[:, None]
             middle = rk4(f, torch.from_numpy(x), torch.from_numpy(u), half).numpy()
-        return Labels(middle, t + step / 2, u, step, x, t, s.V[:, :-1].ravel(), s.V_x[:, :-1].reshape(B * K, -1))
+        return Labels(middle, t + step / 2, u, step)
 
     @staticmethod
     def join(parts: list[Labels]) -> Labels:
@@ -58,26 +54,36 @@ class Labels:
 
 
 def tube(ddp: DDP, bank: SolutionBank, n: int, width: float, rng: np.random.Generator) -> DDPSolution:
-    """Tails from n random states near the bank's trajectories: x(t0) + width * exp(U(-1.5, 0)) * scale * N(0, I)."""
+    """Tails from n random states near the bank's trajectories, each from the solution it is near."""
+    rows, t0, x = tube_states(bank, n, width, ddp.ocp.horizon, rng)
+    return ddp.solve(x, t0, **bank.guess(rows, t0))
+
+
+def tube_states(bank: SolutionBank, n: int, width: float, horizon: float,
+                rng: np.random.Generator) -> tuple[NDArray[np.int64], Array, Array]:
+    """(rows of the bank, t0, x): n states x = x_row(t0) + width * exp(U(-1.5, 0)) * scale * N(0, I)."""
     rows = rng.integers(0, len(bank), n)
-    t0 = rng.uniform(0, 0.97 * ddp.ocp.horizon, n)
+    t0 = rng.uniform(0, 0.97 * horizon, n)
     x = bank.states(rows, t0[:, None])[:, 0]
     x += width * np.exp(rng.uniform(-1.5, 0, (n, 1))) * bank.scale * rng.standard_normal(x.shape)
-    return ddp.solve(x, t0, **bank.guess(rows, t0))
+    return rows, t0, x
 
 
 def visited(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, n: int, kick: float,
             rng: np.random.Generator) -> DDPSolution:
-    """Tails from n states that the policy visits under kicks, the better of a start from the policy's own answer and
-    one from the nearest solution of the bank."""
+    """Tails from n states that the policy visits under kicks."""
     ocp = ddp.ocp
     x0 = ocp.initial_states.sample(max(n // 8, 1), rng)
     t, x = kicked_rollout(ocp, policy, f, x0, kick * bank.scale, rng)
     rows, k = rng.integers(0, len(x), n), rng.integers(0, len(t) - 1, n)
     x, t0 = x[rows, k], t[k]
     fine = np.isfinite(x).all(axis=1) & (np.abs(x) < 10 * np.abs(np.asarray(ocp.system.ubx))).all(axis=1)
-    x, t0 = x[fine], t0[fine]
-    own = ddp.solve(x, t0, u=policy_controls(policy, f, x, t0, ocp.horizon, ddp.intervals))
+    return answered(ddp, bank, policy, f, x[fine], t0[fine])
+
+
+def answered(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, x: Array, t0: Array) -> DDPSolution:
+    """Tails from (x, t0): the better of a start from the policy's own answer and one from the nearest solution."""
+    own = ddp.solve(x, t0, u=policy_controls(policy, f, x, t0, ddp.ocp.horizon, ddp.intervals))
     near = ddp.solve(x, t0, **bank.guess(bank.nearest(x, t0)[:, 0], t0))
     return better(own, near)
 

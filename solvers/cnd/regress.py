@@ -76,28 +76,6 @@ def _control_weights(ocp: OCP, low: Tensor, high: Tensor) -> Tensor:
     return weights / weights.mean()
 
 
-def value_loss(net: FeatureNet, inverse: ca.Function, labels: Labels, scale: Array, slope_weight: float = 1.0) -> Loss:
-    """Mean square error of y and of its gradient in x, in units of `scale` [nx] and of their own mean squares."""
-    V = torch.from_numpy(labels.V)[:, None].requires_grad_(True)
-    y = to_torch(inverse)(V)
-    (dy_dV,) = torch.autograd.grad(y.sum(), V)
-    unit = torch.from_numpy(scale).float()
-    target = y.detach().float()
-    slope = (dy_dV * torch.from_numpy(labels.V_x)).float() * unit
-    slope_weight = slope_weight / float(slope.square().sum(dim=1).mean())
-    x, t = torch.from_numpy(labels.node_x).float(), torch.from_numpy(labels.node_t).float()[:, None]
-
-    def loss(rows: Tensor) -> Tensor:
-        state = x[rows].requires_grad_(True)
-        (phi,) = net.features(state, t[rows])
-        y = net.nets[0](phi)
-        (dy,) = torch.autograd.grad(y.sum(), state, create_graph=True)
-        off = (dy * unit - slope[rows]).square().sum(dim=1).mean()
-        return (y - target[rows]).square().mean() + slope_weight * off
-
-    return loss
-
-
 def _features(net: FeatureNet, x: Array, t: Array) -> tuple[Tensor, ...]:
     """The features of all labels, in float32."""
     return tuple(p.float() for p in net.features(torch.from_numpy(x), torch.from_numpy(t)[:, None]))

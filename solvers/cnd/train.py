@@ -31,9 +31,10 @@ from nocl.nets import FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.bank import SolutionBank, extend, solve_globally
 from nocl.solvers.cnd.controller import CND
-from nocl.solvers.cnd.features import policy_net, value_net
+from nocl.solvers.cnd.features import policy_net
 from nocl.solvers.cnd.labels import Labels, continuous_cost, tube, visited
-from nocl.solvers.cnd.regress import fit, policy_loss, value_loss
+from nocl.solvers.cnd.regress import fit, policy_loss
+from nocl.solvers.cnd.value import ValueLabels, value_loss, value_net, value_solutions
 from nocl.solvers.ddp import DDP
 from nocl.to_torch import to_torch
 
@@ -62,6 +63,7 @@ class TrainSettings:
     lr: float = 4e-3
     hidden: tuple[int, ...] = (64, 64, 64)
     value: bool = True  # whether to train V(x, t) too
+    value_tails: int = 6000  # solved for V, from the tube and from the policy's own answers
     value_iterations: int = 3000
     held_out: int = 64  # initial states that tell when to stop
     gap_median: float = 2e-4  # stop once both are met: (J - J*) / J*, median over the held-out states,
@@ -208,12 +210,16 @@ class _Training:
         return last is not None and last["gap_median"] <= s.gap_median and last["gap_p95"] <= s.gap_p95
 
     def _value(self) -> FeatureNet:
-        s = self.settings
+        s, rng = self.settings, self._rng(2_000_000)
+        with self._stage("value labels", 1) as bar:
+            labels = ValueLabels.of(value_solutions(self.ddp, self.fine, self.bank, self.policy, self.f, s.value_tails,
+                                                    s.width, rng))
+            bar.update()
         with _seeded(self.seed + 1):
-            net, inverse = value_net(self.ocp, self.labels, s.hidden)
-        loss = value_loss(net, inverse, self.labels, self.bank.scale)
+            net = value_net(self.ocp, labels, s.hidden)
+        loss = value_loss(net, labels, self.bank.scale)
         with self._stage("value function", s.value_iterations) as bar:
-            fit(net, loss, len(self.labels), iterations=s.value_iterations, batch=s.batch // 2 or 1, lr=s.lr,
+            fit(net, loss, len(labels), iterations=s.value_iterations, batch=s.batch // 2 or 1, lr=s.lr,
                 seed=self.seed, report=_reporter(bar))
         return net
 
