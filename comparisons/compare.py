@@ -41,7 +41,8 @@ def compare(ocp: OCP, methods: Mapping[str, Any], n: int = 100, x0: ArrayLike | 
 
     `hold=K` judges each feedback once more, held on K intervals, as the method "NAME (K holds)". Nothing is dropped:
     where a method raises, does not converge or blows up, its row says so. Milliseconds: a solver's own `seconds` for
-    that state (the whole control trajectory); for a controller the median time of one control evaluation there.
+    that state (the whole control trajectory; without them, its wall time over the number of states); for a controller
+    the median time of one control evaluation there.
 
     Raises ValueError for methods that are none, or are made for another problem.
     """

@@ -29,9 +29,9 @@ def draw(report: Report) -> dict[str, Figure]:
             figures["costs"] = costs(report)
         figures["trajectories"] = trajectories(report, typical_states(report))
         figures["worst"] = trajectories(report, worst_states(report)[:3])
-        for figure in figures.values():  # laid out once, not for each file
-            figure.draw_without_rendering()
-            figure.set_layout_engine("none")
+        for name in {"gaps", "costs"} & set(figures):  # laid out once, not for each file
+            figures[name].draw_without_rendering()
+            figures[name].set_layout_engine("none")
         return figures
 
 
@@ -112,8 +112,11 @@ def trajectories(report: Report, states: Sequence[int]) -> Figure:
     """States and controls over time; a column for each initial state, a line for each method."""
     s = report.ocp.system
     names = [s.unit(name) for name in s.names]
-    figure = Figure(figsize=(3.1 * len(states) + 0.9, 1.15 * len(names) + 0.9), layout="constrained")
-    axes = figure.subplots(len(names), len(states), sharex=True, sharey="row", squeeze=False)
+    width, height = 3.1 * len(states) + 0.9, 1.15 * len(names) + 0.9
+    figure = Figure(figsize=(width, height))  # laid out in inches: the layout engines take seconds on so many axes
+    edges = {"left": 0.75 / width, "right": 1 - 0.1 / width, "bottom": 0.45 / height, "top": 1 - 0.55 / height}
+    axes = figure.subplots(len(names), len(states), sharex=True, sharey="row", squeeze=False,
+                           gridspec_kw={**edges, "wspace": 0.08, "hspace": 0.15})
     for c, i in enumerate(states):
         axes[0, c].set_title(f"state {i}: " + _gap_title(report, i), fontsize=8)
         axes[-1, c].set_xlabel("t")
@@ -125,7 +128,8 @@ def trajectories(report: Report, states: Sequence[int]) -> Figure:
     for ax, name in zip(axes[:, 0], names, strict=True):
         ax.set_ylabel(name)
     handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=min(len(labels), 4))
+    figure.legend(handles, labels, loc="upper center", ncols=min(len(labels), 4))
+    figure.align_ylabels(axes[:, 0])
     return figure
 
 

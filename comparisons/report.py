@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import textwrap
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -20,6 +21,7 @@ from nocl.simulate import Simulation
 
 COST_FLOOR = 1e-8  # gaps are relative to max(|best cost|, this): costs below it are the judge's rounding
 VIOLATION = 1e-3  # a path constraint below minus this, in its own unit, is violated
+WIDTH = 118  # characters of a line in the terminal
 Row = dict[str, Any]
 Mask = NDArray[np.bool_]
 
@@ -145,7 +147,8 @@ class Report:
 
     def __str__(self) -> str:
         what = f"{self.ocp.system.name}, {_count(len(self.x0), 'initial state')} {self.settings['initial states']}"
-        return "\n".join([what, "", str(self.summary()), "", *NOTE, "", *self.verdict()])
+        said = [textwrap.fill(sentence, WIDTH, subsequent_indent="  ") for sentence in self.verdict()]
+        return "\n".join([what, "", str(self.summary()), "", *NOTE, "", *said])
 
     __repr__ = __str__
 
@@ -227,7 +230,15 @@ def verdict(report: Report) -> list[str]:
     n = len(report.x0)
     near = [f"{row['method']} on {_share(row['within_5'], n)}{_gap_text(row)}" for row in summary]
     sentence = f"Within 5 % of the best known cost of {_count(n, 'initial state')}: " + ", ".join(near) + "."
-    return [sentence, *_speed(summary), *_failures(summary, n)]
+    return [sentence, *_manners(summary), *_speed(summary), *_failures(summary, n)]
+
+
+def _manners(summary: Sequence[Row]) -> list[str]:
+    """How each control was run, where they differ: holding a control costs something by itself."""
+    if len({row["how"] for row in summary}) < 2:
+        return []
+    return ["How they were run: " + "; ".join(f"{row['method']}: {row['how']}" for row in summary)
+            + ". Holding a control costs something by itself."]
 
 
 def _gap_text(row: Row) -> str:

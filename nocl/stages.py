@@ -2,7 +2,7 @@
 
 dynamics/   the learned dynamics                              cnd/      controller and value function
 export/     policy.casadi, value.casadi, dynamics.casadi, c/  report/   report.html, rows.csv, summary.json, figures/
-nmpc/       NMPC's answers so far, so that an interrupted comparison goes on
+checkpoint/ what an interrupted stage goes on from; gone once it is finished
 """
 
 from __future__ import annotations
@@ -16,13 +16,14 @@ import time
 import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from nocl import store
+from nocl import __version__, store
 from nocl.ocp import OCP
 from nocl.solvers.cnd import CND, TrainSettings, train
 from nocl.sysid import LearnedDynamics, Settings, identify
@@ -30,7 +31,7 @@ from nocl.sysid import LearnedDynamics, Settings, identify
 QUICK_IDENTIFY = Settings(iterations=300, polish=10)
 QUICK_TRAIN = TrainSettings(seeds=6, starts=6, states=60, tails=300, visits=200, rounds=1, iterations=400,
                             value_tails=400, value_iterations=300, held_out=16)
-PARTS = ("dynamics", "cnd", "export", "nmpc", "report", "checkpoint")  # folders in a run's folder
+PARTS = ("dynamics", "cnd", "export", "report", "checkpoint")  # folders in a run's folder
 KEY = "run"  # of a card: what the stage was made from
 
 
@@ -113,17 +114,24 @@ class Stages:
 
         x0 = fresh_states(self.ocp, n, self.seed)
         chosen: dict[str, Any] = {name: cnd if name == "CND" else method(self.ocp, name, intervals) for name in methods}
+        checkpoint = self._nmpc_checkpoint(n, intervals)
         if "NMPC" in chosen:
-            say(f"NMPC: {n} initial states, {intervals} intervals")
-            chosen["NMPC"] = chosen["NMPC"].solve(x0, out=self.folder / "nmpc")
+            say(f"NMPC: solving {n} initial states, {intervals} intervals")
+            chosen["NMPC"] = chosen["NMPC"].solve(x0, out=checkpoint)
         say(f"comparing {', '.join(methods)} on the exact dynamics")
         report = compare(self.ocp, chosen, n=n, seed=fresh_seed(self.seed), hold=hold)
         path = report.save(out)
+        _forget(checkpoint)
         say(f"\n{report}\n\nreport: {path}")
 
     def _made_from(self, **settings: Any) -> dict[str, Any]:
         problem = hashlib.sha256(json.dumps(self.ocp.to_data(), sort_keys=True).encode()).hexdigest()
         return {"problem": problem, "seed": self.seed, "quick": self.quick, **settings}
+
+    def _nmpc_checkpoint(self, n: int, intervals: int) -> Path:
+        """Where NMPC's answers so far are kept while a comparison lasts: another one goes elsewhere."""
+        key = json.dumps([self._made_from(n=n, intervals=intervals), __version__, version("casadi")], sort_keys=True)
+        return self.folder / "checkpoint" / f"nmpc-{hashlib.sha256(key.encode()).hexdigest()[:12]}"
 
     def _dynamics_there(self) -> LearnedDynamics | None:
         folder = self.folder / "dynamics"

@@ -1,4 +1,4 @@
-"""compare: gaps against a known optimum, one row for every method and state, the same states for all, no lost failure."""
+"""compare: gaps to a known optimum, a row for every method and state, the same states for all, no lost failure."""
 
 import dataclasses
 
@@ -78,6 +78,7 @@ def test_summary(report):
     text = str(report.summary())
     assert all(name in text for name in summary)
     assert "LQR on all 6" in report.verdict()[0]
+    assert "NMPC: open loop, held on 20 intervals" in report.verdict()[1]
 
 
 def test_the_report_is_frozen(report):

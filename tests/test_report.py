@@ -1,4 +1,4 @@
-"""A report's files: complete, self-contained, replaced without touching what others wrote, and the same numbers in all."""
+"""A report's files: complete, self-contained, replaced without touching what others wrote, one truth in all."""
 
 import csv
 import json

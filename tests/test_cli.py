@@ -1,0 +1,270 @@
+"""The command line: bad input is one line, exit code 2, nothing written; a run's stages are taken up where they stand."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import nocl
+from nocl import stages
+from nocl.cli import main
+from nocl.solvers import NMPC
+from nocl.solvers.cnd import CND, TrainSettings
+from nocl.sysid import Settings
+
+SYSTEM = """
+import casadi as ca
+import nocl
+
+p, v, u = (ca.SX.sym(name) for name in "pvu")
+cubic = nocl.System("cubic", x=ca.vertcat(p, v), u=u, xdot=ca.vertcat(v, u - p**3),
+                    lbu=[-3], ubu=[3], lbx=[-2, -2], ubx=[2, 2])
+ocp = nocl.OCP.quadratic(cubic, horizon=2.0, x_goal=[0, 0], u_goal=[0],
+                         initial_states=nocl.Gaussian(mean=[1, 0], std=[0.1, 0.1]))
+"""
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A working folder with a good problem, broken ones, and a file where a folder should be."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "cubic.py").write_text(SYSTEM)
+    (tmp_path / "moving.py").write_text(SYSTEM.replace("u - p**3", "u + 1"))  # its goal is no equilibrium
+    (tmp_path / "empty.py").write_text("x = 1\n")
+    (tmp_path / "broken.py").write_text("def ocp(:\n")
+    (tmp_path / "raises.py").write_text("1 / 0\n")
+    (tmp_path / "number.py").write_text("ocp = 3\n")
+    (tmp_path / "notes.txt").write_text("mine")
+    (tmp_path / "half").mkdir()
+    (tmp_path / "half" / "report").write_text("mine")
+    (tmp_path / "other" / "cnd").mkdir(parents=True)
+    (tmp_path / "other" / "cnd" / "cnd.safetensors").write_text("not one")
+    return tmp_path
+
+
+def tree(folder):
+    return {str(p.relative_to(folder)): p.read_bytes() if p.is_file() else None for p in folder.rglob("*")}
+
+
+BAD = [
+    ("", "COMMAND"),
+    ("frobnicate", "frobnicate"),
+    ("run", "NAME_OR_FILE"),
+    ("run nothing_of_the_kind", "no problem 'nothing_of_the_kind'"),
+    ("run cartpol", "did you mean 'cartpole'"),
+    ("run missing.py", "no file missing.py"),
+    ("run notes.txt", "not a .py file"),
+    ("run half", "not a .py file"),
+    ("run empty.py", "defines no `ocp`"),
+    ("run broken.py", "broken.py, line 1"),
+    ("run raises.py", "ZeroDivisionError"),
+    ("run number.py", "`ocp` is a int"),
+    ("run cubic.py --n 0", "at least 1"),
+    ("run cubic.py --n -3", "at least 1"),
+    ("run cubic.py --n many", "at least 1"),
+    ("run cubic.py --seed -1", "at least 0"),
+    ("run cubic.py --seed 1.5", "at least 0"),
+    ("run cubic.py --intervals 0", "at least 1"),
+    ("run cubic.py --intervals 1", "intervals"),
+    ("run cubic.py --methods CND,MAGIC", "CND, NMPC, LQR, DDP"),
+    ("run cubic.py --methods CND,CND", "CND, NMPC, LQR, DDP"),
+    ("run cubic.py --methods=", "CND, NMPC, LQR, DDP"),
+    ("run cubic.py --out notes.txt", "is a file"),
+    ("run cubic.py --out notes.txt/deeper", "is a file"),
+    ("run cubic.py --out half", "is a file"),
+    ("run cubic.py --out other", "cut off"),
+    ("run cubic.py --frobnicate", "--frobnicate"),
+    ("run cubic.py extra", "extra"),
+    ("run moving.py --methods LQR --out new", "LQR"),
+    ("identify nothing", "no problem"),
+    ("identify cubic.py --out notes.txt", "is a file"),
+    ("train cubic.py --out notes.txt", "is a file"),
+    ("solve cubic.py --solver magic", "magic"),
+    ("solve cubic.py --out notes.txt", "is a file"),
+    ("export missing", "no folder missing"),
+    ("export half", "holds no cnd.safetensors"),
+    ("export other", "cut off"),
+    ("export half --to cobol", "cobol"),
+    ("compare missing", "no folder missing"),
+    ("compare notes.txt", "no folder notes.txt"),
+    ("compare half --hold 0", "at least 1"),
+]
+
+
+@pytest.mark.parametrize(("line", "said"), BAD)
+def test_bad_input_is_one_line_and_nothing_is_written(here, capsys, line, said):
+    before = tree(here)
+    assert main(line.split()) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("nocl: error: ")
+    assert captured.err.count("\n") == 1
+    assert said in captured.err
+    assert "Traceback" not in captured.err
+    assert tree(here) == before
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_folder_of_others_is_told(here, capsys):
+    (here / "theirs").mkdir(mode=0o500)
+    assert main(["run", "cubic.py", "--out", "theirs"]) == 2
+    assert "cannot be written to" in capsys.readouterr().err
+
+
+def test_debug_shows_the_traceback(here, capsys):
+    assert main(["run", "raises.py", "--debug"]) == 2
+    err = capsys.readouterr().err
+    assert "Traceback" in err
+    assert err.splitlines()[-1].startswith("nocl: error: ")
+
+
+def test_an_unexpected_error_is_one_line_too(here, capsys, monkeypatch):
+    def fails(*args):
+        raise RuntimeError("something\nof CasADi's")
+
+    monkeypatch.setattr(stages, "solve", fails)
+    assert main(["solve", "cubic.py"]) == 2
+    assert capsys.readouterr().err == \
+        "nocl: error: unexpected RuntimeError: something of CasADi's (--debug shows where)\n"
+
+
+def test_interruption_is_one_line_and_130(here, capsys, monkeypatch):
+    def interrupted(*args, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(stages, "identify", interrupted)
+    assert main(["run", "cubic.py"]) == 130
+    assert "interrupted" in capsys.readouterr().err
+
+
+def test_help_needs_neither_torch_nor_matplotlib():
+    code = ("import sys; from nocl.cli import main\ntry: main(['--help'])\nexcept SystemExit as end: code = end.code\n"
+            "sys.exit(code or any(m in sys.modules for m in ('torch', 'matplotlib', 'scipy', 'tqdm')))")
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0
+    for word in ("list", "run", "identify", "train", "solve", "export", "compare"):
+        assert word in done.stdout
+
+
+@pytest.mark.parametrize("command", ["run", "identify", "train", "solve", "export", "compare", "list"])
+def test_each_command_explains_itself(command, capsys):
+    with pytest.raises(SystemExit) as end:
+        main([command, "--help"])
+    assert end.value.code == 0
+    assert "usage: nocl " + command in capsys.readouterr().out
+
+
+def test_list(capsys):
+    assert main(["list"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[1:]] == list(nocl.systems.NAMES)
+    assert lines[1].split()[1:4] == ["4", "1", "4"]
+
+
+def test_version(capsys):
+    with pytest.raises(SystemExit):
+        main(["--version"])
+    assert capsys.readouterr().out == f"nocl {nocl.__version__}\n"
+
+
+@pytest.mark.parametrize("solver", ["nmpc", "ddp", "lqr"])
+def test_solve_writes_solutions(here, capsys, solver):
+    assert main(["solve", "cubic.py", "--solver", solver, "--n", "2", "--intervals", "10", "--out", "new"]) == 0
+    assert "2 of 2 solved" in capsys.readouterr().out
+    with np.load(here / "new" / "solutions" / f"{solver}.npz", allow_pickle=False) as data:
+        np.testing.assert_array_equal(data["x0"], nocl.load_ocp("cubic.py").initial_states.sample(2, 1))
+        assert data["success"].all()
+        assert data["cost"].shape == (2,)
+        assert np.isfinite(data["x"]).all()
+    assert json.loads((here / "new" / "solutions" / f"{solver}.json").read_text())["n"] == 2
+
+
+SMALL = TrainSettings(seeds=3, starts=2, states=6, tails=30, visits=20, rounds=0, iterations=40, value_tails=30,
+                      value_iterations=20, held_out=4, hidden=(8,))
+
+
+def small(monkeypatch):
+    monkeypatch.setattr(stages, "QUICK_TRAIN", SMALL)
+    monkeypatch.setattr(stages, "QUICK_IDENTIFY", Settings(iterations=20, polish=2, samples=500))
+
+
+RUN = ["run", "cubic.py", "--out", "out", "--quick", "--n", "2", "--intervals", "10"]
+
+
+def test_a_run_from_a_users_file_to_its_report(here, capsys, monkeypatch):
+    small(monkeypatch)
+    assert main(RUN) == 0
+    out = capsys.readouterr().out
+    run = here / "out"
+    assert "report: out/report/report.html" in out
+    assert "Within 5 % of the best known cost of 2 initial states: CND" in out
+    assert {p.name for p in run.iterdir()} == {"dynamics", "cnd", "export", "report"}
+    assert {p.name for p in (run / "export").iterdir()} == {"policy.casadi", "value.casadi", "dynamics.casadi", "c"}
+    cnd = CND.load(run / "cnd")
+    policy = ca.Function.load(str(run / "export" / "policy.casadi"))
+    x = np.array([1.0, 0.1])
+    np.testing.assert_allclose(policy(x, 0.5).full().ravel(), cnd(x, 0.5), rtol=1e-12)
+    rows = json.loads((run / "report" / "summary.json").read_text())["summary"]
+    assert [row["method"] for row in rows] == ["CND", "NMPC"]
+
+    before = {p: p.stat().st_mtime_ns for part in ("dynamics", "cnd") for p in (run / part).iterdir()}
+    assert main([*RUN[:-3], "3", "--intervals", "10", "--methods", "cnd,lqr"]) == 0  # the same, on other states
+    out = capsys.readouterr().out
+    assert "dynamics: taken from out/dynamics" in out
+    assert "controller: taken from out/cnd" in out
+    assert {p: p.stat().st_mtime_ns for p in before} == before
+
+    assert main([*RUN, "--seed", "1", "--exact"]) == 0
+    out = capsys.readouterr().out
+    assert "controller: training on the exact dynamics (what is there was made for another" in out
+    assert CND.load(run / "cnd").card["seed"] == 1
+
+    assert main(["compare", "out", "--n", "2", "--methods", "CND,DDP", "--hold", "20", "--out", "elsewhere"]) == 0
+    assert "CND (20 holds)" in capsys.readouterr().out
+    assert (here / "elsewhere" / "report.html").is_file()
+    assert main(["export", "out", "--to", "c", "--out", "source"]) == 0
+    assert {p.name for p in (here / "source").iterdir()} == {"c"}
+
+
+def test_a_controller_that_no_run_made_is_not_overwritten(here, capsys, monkeypatch):
+    small(monkeypatch)
+    ocp = nocl.load_ocp("cubic.py")
+    nocl.train(ocp, settings=SMALL, progress=False).save("mine/cnd")
+    before = tree(here)
+    assert main(["run", "cubic.py", "--out", "mine", "--quick"]) == 2
+    assert "would be overwritten" in capsys.readouterr().err
+    assert tree(here) == before
+
+
+def test_an_interrupted_run_goes_on_from_the_last_finished_stage(here, capsys, monkeypatch):
+    small(monkeypatch)
+    with monkeypatch.context() as patched:
+        def interrupted(*args, **options):
+            raise KeyboardInterrupt
+
+        patched.setattr(NMPC, "solve", interrupted)
+        assert main(RUN) == 130
+    assert not (here / "out" / "report").exists()
+    capsys.readouterr()
+    assert main(RUN) == 0
+    out = capsys.readouterr().out
+    assert "controller: taken from out/cnd" in out
+    assert (here / "out" / "report" / "report.html").is_file()
+
+
+@pytest.mark.slow
+def test_ctrl_c_in_a_real_process(here):
+    process = subprocess.Popen([sys.executable, "-m", "nocl", "run", "cartpole", "--out", "out"],
+                               stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=here)
+    assert process.stdout.readline().startswith("dynamics: learning")
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in err
+    assert err.splitlines()[-1].startswith("nocl: interrupted")
+    assert not list((here / "out").rglob("*.part"))
