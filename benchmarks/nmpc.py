@@ -59,16 +59,16 @@ class Problem:
 
 
 def tool_nocl(p: Problem, solver: str, **options):
-    """solve(x0, (x, u)) -> (x, u, success)."""
+    """solve(x0, (x, u), warm) -> (x, u, success)."""
     import nocl
     from nocl.solvers import NMPC
 
     nmpc = NMPC(nocl.load_ocp(p.name), p.N, solver=solver, options={f"{solver}.tol": TOL}, **options)
     t = np.linspace(0, p.T, p.N + 1)
-    nmpc.program.solver  # noqa: B018
+    nmpc.program.solver, nmpc.program.warm.solver  # noqa: B018
 
-    def solve(x0, guess):
-        answer = nmpc.program.solve(x0, t, *guess)
+    def solve(x0, guess, warm):
+        answer = (nmpc.program.warm if warm else nmpc.program).solve(x0, t, *guess)
         return answer.x, answer.u, answer.success
 
     return solve
@@ -90,7 +90,7 @@ def tool_opti(p: Problem):
     opti.minimize(cost)
     opti.solver("ipopt", {"expand": True, **IPOPT})
 
-    def solve(x, guess):
+    def solve(x, guess, _):
         opti.set_value(x0, x)
         opti.set_initial(X, guess[0].T)
         opti.set_initial(U, guess[1].T)
@@ -122,7 +122,7 @@ def tool_dompc(p: Problem):
         mpc.set_nl_cons(f"h{i}", -p.h(x)[i], ub=0)
     mpc.setup()
 
-    def solve(x0, guess):
+    def solve(x0, guess, _):
         for k in range(p.N + 1):
             mpc.opt_x_num["_x", k, 0, -1] = guess[0][k]
         for k in range(p.N):
@@ -157,7 +157,7 @@ def tool_rockit(p: Problem, solver: str):
     states, controls = ocp.sample(x, grid="control")[1], ocp.sample(u, grid="control-")[1]
     function = ocp.to_function("solve", [x0, states, controls], [states, controls])  # its fast way to repeat
 
-    def solve(start, guess):
+    def solve(start, guess, _):
         try:
             got = function(start, guess[0].T, guess[1].T)
         except RuntimeError:  # a solve that fails raises
@@ -183,13 +183,13 @@ def child(tool: str, source: str, target: str, cache: str) -> None:
     result: dict = {"build": time.perf_counter() - begin, "cold": [], "warm": [], "cost": [], "ok": [], "warm_cost": [],
                     "warm_ok": []}
     begin = time.perf_counter()
-    solve(p.x0[0], p.cold(p.x0[0]))
+    solve(p.x0[0], p.cold(p.x0[0]), False)
     result["first"] = time.perf_counter() - begin
     for x0, warm in zip(p.x0, p.warm, strict=True):
         guess = p.cold(x0)
         for start, kind in ((x0, ""), (warm, "warm_")):
             begin = time.perf_counter()
-            *guess, ok = solve(start, guess)
+            *guess, ok = solve(start, guess, bool(kind))
             result["warm" if kind else "cold"].append(time.perf_counter() - begin)
             result[f"{kind}cost"].append(p.cost(start, guess[1]))
             result[f"{kind}ok"].append(bool(ok))

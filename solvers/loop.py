@@ -82,7 +82,8 @@ class Loop:
     def _solve(self, x: Array, guess: tuple[Array, Array], nodes: Array, t: float) -> Solution:
         """The new plan: a row whose solve fails twice holds the guess instead."""
         warm = self.plan is not None
-        solution = self.nmpc.solve(x, guess if warm else None, nodes=nodes, workers=1, progress=False)
+        plan = Trajectory(nodes, *guess) if warm else None
+        solution = self.nmpc.solve(x, plan, nodes=nodes, workers=1, progress=False)
         failed = np.flatnonzero(~np.asarray(solution.success))
         if warm and failed.size:
             again = self.nmpc.solve(x[failed], nodes=nodes, workers=1, progress=False)
@@ -92,8 +93,8 @@ class Loop:
         self.stats.append({"t": t, "success": success, "seconds": solution.seconds, "cost": solution.cost,
                            "iterations": solution.iterations, "message": solution.message, "source": source})
         ok = success[:, None, None]
-        plan = Trajectory(solution.t, np.where(ok, solution.x, guess[0]), np.where(ok, solution.u, guess[1]))
-        return replace(solution, trajectory=plan)
+        held = Trajectory(solution.t, np.where(ok, solution.x, guess[0]), np.where(ok, solution.u, guess[1]))
+        return replace(solution, trajectory=held)
 
 
 def shifted(last: Solution, x: Array, nodes: Array) -> tuple[Array, Array]:

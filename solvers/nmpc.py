@@ -124,8 +124,8 @@ class NMPC:
 
         Parameters
         ----------
-        guesses : tried first: a Solution or Trajectory, controls u [B, N, nu], (x [B, N+1, nx], u), a controller
-            (x, t) -> u whose rollout is meant, or a list of them
+        guesses : tried first: a Solution or Trajectory nearby (solved with a small barrier: a warm start), controls u
+            [B, N, nu], (x [B, N+1, nx], u), a controller (x, t) -> u whose rollout is meant, or a list of them
         nodes : times of the nodes [N+1]; default: N equal intervals from t0 to the window's end
         starts : built-in starts for each state; default: self.starts, or none where guesses are given
         gains : also the Solution's `gains` and `hessian`
@@ -143,15 +143,16 @@ class NMPC:
         s = self.ocp.system
         rows, _ = checks.states(x0, s.nx, s.name)
         t = self._nodes(t0, nodes)
-        given = [_given(one, self, rows, t) for one in (guesses if isinstance(guesses, list) else [guesses])
-                 if one is not None]
+        tried = [one for one in (guesses if isinstance(guesses, list) else [guesses]) if one is not None]
+        tried.sort(key=lambda one: not _is_solution(one))
+        given, warm = [_given(one, self, rows, t) for one in tried], sum(map(_is_solution, tried))
         n = starts if starts is not None else (0 if given else self.starts)
         if n < 1 and not given:
             raise ValueError(f"starts is {n}; expected at least 1, or guesses")
         show = sys.stderr.isatty() if progress is None else progress
-        journal = Journal(None if out is None else Path(out), self._run_key(rows, t, given, n) if out else "")
+        journal = Journal(None if out is None else Path(out), self._run_key(rows, t, given, n, warm) if out else "")
         run = _Run(self, rows, t, Pool(workers), journal, show)
-        run.first([[guess[i] for guess in given] for i in range(len(rows))], n)
+        run.first([[guess[i] for guess in given] for i in range(len(rows))], n, warm)
         if n:
             run.exchange()
         solution = _collect(run.searches, t)
@@ -190,10 +191,10 @@ class NMPC:
             raise ValueError(f"nodes end at {t[-1]:g}; expected {T:g}, the horizon: give NMPC a shorter `horizon`")
         return t
 
-    def _run_key(self, x0: Array, t: Array, given: list[list[Guess]], n: int) -> str:
+    def _run_key(self, x0: Array, t: Array, given: list[list[Guess]], *counts: int) -> str:
         """A fingerprint of all that outcomes depend on."""
         arrays = [part for guess in given for row in guess for part in row]
-        return fingerprint(self.key, x0, t, *arrays, n, self.passes, self.neighbours, self.seed, version("casadi"),
+        return fingerprint(self.key, x0, t, *arrays, counts, self.passes, self.neighbours, self.seed, version("casadi"),
                            version("nocl"))
 
 
@@ -261,9 +262,9 @@ class _Run:
         self.nmpc, self.x0, self.t, self.pool, self.journal, self.show = nmpc, x0, t, pool, journal, show
         self.searches = [Search(nmpc.program, x) for x in x0]
 
-    def first(self, guesses: list[list[Guess]], starts: int) -> None:
-        """Each state from the guesses given, then the built-in starts."""
-        self._do([Task(f"start-{i:06d}", i, self.x0[i], self.t, guesses[i], starts, self.nmpc.seed)
+    def first(self, guesses: list[list[Guess]], starts: int, warm: int) -> None:
+        """Each state from the guesses given, `warm` of them solutions, then from the built-in starts."""
+        self._do([Task(f"start-{i:06d}", i, self.x0[i], self.t, guesses[i], warm, starts, self.nmpc.seed)
                   for i, search in enumerate(self.searches) if not search.refusal], "NMPC")
 
     def exchange(self) -> None:
@@ -325,6 +326,10 @@ def _collect(searches: list[Search], t: Array) -> Solution:
         seconds=np.array([e.seconds for e in searches]), iterations=np.array([e.iterations for e in searches]),
         starts=np.array([len(e.costs) for e in searches]), hits=np.array([e.hits for e in searches]),
         optima=[e.optima for e in searches], dense=between)
+
+
+def _is_solution(guess: Any) -> bool:
+    return isinstance(guess, (Solution, Trajectory))
 
 
 def _given(guess: Any, nmpc: NMPC, x0: Array, t: Array) -> list[Guess]:

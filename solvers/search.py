@@ -25,6 +25,7 @@ class Task:
     x0: Array  # [nx]
     t: Array  # [N+1]
     guesses: Sequence[Guess] = ()
+    warm: int = 0  # how many of these, the first ones, are solutions of problems nearby
     starts: int = 0
     seed: int = 0
 
@@ -44,7 +45,10 @@ class Outcome:
 
 def attempt(program: Transcription, task: Task, guesses: Sequence[Guess]) -> Outcome:
     """Solve from each guess."""
-    begin, answers = time.perf_counter(), [program.solve(task.x0, task.t, x, u) for x, u in guesses]
+    begin, answers = time.perf_counter(), list[Answer]()
+    for i, (x, u) in enumerate(guesses):
+        warm = program.warm.solve(task.x0, task.t, x, u) if i < task.warm else None
+        answers.append(warm if warm is not None and warm.success else program.solve(task.x0, task.t, x, u))
     answers += _second_opinion(program, task, answers)
     seconds = time.perf_counter() - begin
     good, bad = ([a for a in answers if bool(a.success) is ok] for ok in (True, False))

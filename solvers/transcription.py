@@ -25,6 +25,12 @@ BACKENDS: dict[str, dict[str, Any]] = {
     "ipopt": {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-9, "ipopt.max_iter": 500},
     "fatrop": {"fatrop.print_level": 0, "fatrop.tol": 1e-9, "fatrop.max_iter": 500},
 }
+WARM: dict[str, dict[str, Any]] = {  # near a solution: a barrier that is small from the start does not push it away
+    "ipopt": {"ipopt.mu_init": 1e-8, "ipopt.warm_start_init_point": "yes", **{
+        f"ipopt.warm_start_{name}": 1e-8 for name in ("bound_push", "bound_frac", "slack_bound_push",
+                                                      "slack_bound_frac", "mult_bound_push")}},
+    "fatrop": {"fatrop.mu_init": 1e-8},
+}
 FEASIBLE = 1e-6  # largest violation of a constraint in a solution, in the constraint's own unit
 
 
@@ -182,6 +188,11 @@ class Transcription:
         """The solver's limit of iterations, where it is known."""
         name = f"{self.backend}.max_iter"
         return float(dict(self.options).get(name, BACKENDS.get(self.backend, {}).get(name, np.inf)))
+
+    @cached_property
+    def warm(self) -> Transcription:
+        """The same program for guesses that are solutions of problems nearby."""
+        return replace(self, options=tuple({**WARM.get(self.backend, {}), **dict(self.options)}.items()))
 
     @cached_property
     def second(self) -> Transcription:

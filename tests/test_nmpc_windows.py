@@ -157,3 +157,62 @@ def test_bad_windows(options, words):
 def test_a_bad_hold_is_refused():
     with pytest.raises(ValueError, match="hold is 0"):
         NMPC(nocl.load_ocp("double_integrator"), 10).controller(hold=0)
+
+
+@pytest.mark.parametrize("solver", ["fatrop", "ipopt"])
+def test_a_solution_nearby_is_a_warm_start(solver):
+    """A Solution as a guess takes fewer iterations than its arrays, which are taken for any guess; same optimum."""
+    ocp = nocl.load_ocp("acrobot")
+    nmpc, x0 = NMPC(ocp, 30, starts=2, passes=0, solver=solver), ocp.initial_states.sample(2, 0)
+    solution = nmpc.solve(x0)
+    warm, cold = nmpc.solve(x0 + 0.01, solution), nmpc.solve(x0 + 0.01, (solution.x, solution.u))
+    assert warm.cost == pytest.approx(cold.cost, rel=1e-7)
+    assert warm.u == pytest.approx(cold.u, abs=1e-3)
+    assert warm.iterations.sum() < cold.iterations.sum()
+
+
+def test_a_controller_as_a_start():
+    """LQR and a policy's rollout are starts like others; one that fails gives way without an error."""
+    ocp = nocl.load_ocp("pendulum")
+    nmpc, x0 = NMPC(ocp, 30), ocp.initial_states.sample(2, 0)
+    best = nmpc.solve(x0)
+
+    def pump(x, t):
+        return np.clip(5 * np.sign(x[..., 1:2] + 1e-9) * np.where(np.cos(x[..., :1]) < 0.7, 1, -1), -5, 5)
+
+    from nocl.solvers import LQR
+    for controllers in (pump, [LQR(ocp), pump, lambda x, t: np.array([np.nan])]):
+        found = nmpc.solve(x0, controllers, starts=8)
+        assert found.cost == pytest.approx(best.cost, rel=1e-6)
+    assert (nmpc.solve(x0, [pump, LQR(ocp)]).starts == 2).all()
+
+
+def test_distinct_optima_are_listed():
+    """Cart-pole from hanging swings up in several ways: costs rise, the best first, starts add up."""
+    ocp = nocl.load_ocp("cartpole")
+    x0 = np.random.default_rng(0).uniform(-1, 1, (3, 4)) * [2.0, 3.0, np.pi, 5.0]
+    solution = NMPC(ocp, 40, starts=8).solve(x0)
+    for i, optima in enumerate(solution.optima):
+        assert optima[0, 0] == solution.cost[i]
+        assert (np.diff(optima[:, 0]) > 1e-3 * optima[1:, 0]).all()
+        assert optima[0, 1] == solution.hits[i]
+        assert optima[:, 1].sum() <= solution.starts[i]
+    assert max(len(optima) for optima in solution.optima) > 1
+
+
+def test_mirror_images_and_sides():
+    """Dubins is its own mirror image at py = 0: found, used, and a start passes the obstacle on either side."""
+    from nocl.solvers import guesses
+
+    ocp = nocl.load_ocp("dubins")
+    assert [(x.tolist(), u.tolist()) for x, u in guesses.mirrors(ocp)] == [([1, -1, -1], [1, -1])]
+    assert len(guesses.mirrors(nocl.load_ocp("cartpole"))) == 1
+    assert guesses.mirrors(nocl.load_ocp("quadrotor")) == []  # larger than is looked for
+    assert not any((x < 0).any() for x, _ in guesses.mirrors(walled()))  # the wall stands on one side
+    lines = guesses.sides(ocp, np.array([-3.0, 0.0, 0.3]), 40)
+    assert sorted(np.sign(line[20, 1]) for line in lines) == [-1, 1]
+    assert all(ocp.h(line.T).full().min() >= 0 for line in lines)
+    assert guesses.sides(ocp, np.array([-3.0, 3.0, 0.0]), 40) == []
+    x0 = np.array([[-3.0, 0.7, 0.4], [-3.0, -0.7, -0.4]])
+    images = NMPC(ocp, 40, starts=3).solve(x0)
+    assert images.cost[0] == pytest.approx(images.cost[1], rel=1e-6)
