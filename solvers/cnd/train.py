@@ -63,7 +63,7 @@ class TrainSettings:
     lr: float = 4e-3
     hidden: tuple[int, ...] = (64, 64, 64)
     value: bool = True  # whether to train V(x, t) too
-    value_tails: int = 6000  # solved for V, from the tube and from the policy's own answers
+    value_tails: int = 3000  # solved for V, from the tube and from the policy's own answers
     value_iterations: int = 3000
     held_out: int = 64  # initial states that tell when to stop
     gap_median: float = 2e-4  # stop once both are met: (J - J*) / J*, median over the held-out states,

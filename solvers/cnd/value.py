@@ -1,0 +1,114 @@
+"""The value function V(x, t): a sum of squares, fitted to optimal costs-to-go and costates where the policy is at home.
+
+V = floor + |y|^2 with a network y(x, t) of nx + 1 outputs: for a linear-quadratic problem y is linear in x, at the
+horizon V = G is one where G is a sum of squares, and V never falls below what costs can be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import casadi as ca
+import numpy as np
+import torch
+from torch import Tensor
+
+from nocl.checks import Array
+from nocl.nets import MLP, FeatureNet
+from nocl.ocp import OCP
+from nocl.solvers.bank import SolutionBank
+from nocl.solvers.cnd.features import features
+from nocl.solvers.cnd.labels import Field, answered, tube_states
+from nocl.solvers.cnd.regress import Loss
+from nocl.solvers.ddp import DDP, DDPSolution
+from nocl.to_torch import to_torch
+
+SMALL = 0.1  # of the median: labels below count as if they were that large in relative errors
+ROUND = 0.01  # relative errors above it count by their size, not their square: few labels are hard, or not global
+CHUNK = 20_000  # labels whose features are computed at a time
+
+
+@dataclass(frozen=True, eq=False)
+class ValueLabels:
+    """Costs-to-go and costates."""
+
+    x: Array  # [n, nx]
+    t: Array  # [n]
+    V: Array  # [n]
+    V_x: Array  # [n, nx]
+
+    def __len__(self) -> int:
+        return len(self.V)
+
+    @staticmethod
+    def of(solutions: Sequence[DDPSolution]) -> ValueLabels:
+        """Start, end and nodes at doubling distances between them: later nodes have drawn together and tell little."""
+        solved = [s[s.success] for s in solutions]
+        K = solved[0].u.shape[1]
+        doubling = 2 ** np.arange(int(np.log2(max(K - 1, 1))) + 1)
+        nodes = np.unique(np.concatenate([[0, K], doubling[doubling < K]]))
+        return ValueLabels(*(np.concatenate([np.concatenate(getattr(s, name)[:, nodes]) for s in solved])
+                             for name in ValueLabels.__dataclass_fields__))
+
+
+def value_solutions(ddp: DDP, fine: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, n: int, width: float,
+                    rng: np.random.Generator) -> list[DDPSolution]:
+    """The bank's solutions and tails from n states of the tube, on the fine grid: a held control costs O(h^2) more than
+    a continuous one."""
+    _, t0, x = tube_states(bank, n, width, ddp.ocp.horizon, rng)
+    tails, whole = answered(ddp, bank, policy, f, x, t0), bank.solution
+    times = fine.intervals // ddp.intervals
+    return [fine.solve(s.x[:, 0], s.t[:, 0], u=np.repeat(s.u, times, axis=1)) for s in (whole, tails[tails.success])]
+
+
+def value_net(ocp: OCP, labels: ValueLabels, sizes: tuple[int, ...]) -> FeatureNet:
+    """(x, t) -> V = floor + unit |y|^2; the floor is 0 where all labels are positive, else below them."""
+    s, time = ocp.system, ca.SX.sym("t")
+    phi = features(ocp, labels.x, labels.t, plain=True)
+    y, floor = ca.SX.sym("y", s.nx + 1), _floor(labels)
+    unit = float(np.median(labels.V - floor))
+    V = ca.Function("value", [s.x, time, y], [floor + unit * ca.sumsqr(y)], ["x", "t", "y"], ["V"])
+    return FeatureNet(phi, [MLP([phi.numel_out(0), *sizes, s.nx + 1], skip=True)], V)
+
+
+def _floor(labels: ValueLabels) -> float:
+    least = float(labels.V.min())
+    return 0.0 if least >= 0 else least - float(labels.V.std())
+
+
+def value_loss(net: FeatureNet, labels: ValueLabels, scale: Array, slope_weight: float = 0.1) -> Loss:
+    """Mean norm of the relative errors of V - floor and of its gradient, states in units of `scale` [nx].
+
+    Relative, because V and its gradient differ by orders of magnitude between the start and the end of a horizon.
+    """
+    x, t = torch.from_numpy(labels.x).float(), torch.from_numpy(labels.t).float()[:, None]
+    phi, slope, rows_of, columns = _features_and_slopes(net, labels, scale)
+    V, V_x = torch.from_numpy(labels.V).float()[:, None], torch.from_numpy(labels.V_x * scale).float()
+    size, steepness = V - _floor(labels), V_x.square().sum(1, keepdim=True)
+    per_V, per_slope = ((1 / (a + SMALL * a.median())) for a in (size, steepness))
+
+    def loss(rows: Tensor) -> Tensor:
+        p = phi[rows].requires_grad_(True)
+        answer = net.combine((x[rows], t[rows]), [net.nets[0](p)])
+        (by_phi,) = torch.autograd.grad(answer.sum(), p, create_graph=True)
+        gradient = torch.zeros_like(V_x[rows]).index_add(1, columns, by_phi[:, rows_of] * slope[rows])
+        off = (gradient - V_x[rows]).square().sum(1, keepdim=True) * per_slope[rows]
+        square = ((answer - V[rows]) * per_V[rows]).square() + slope_weight * off
+        return (square + ROUND**2).sqrt().mean()
+
+    return loss
+
+
+def _features_and_slopes(net: FeatureNet, labels: ValueLabels, scale: Array) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """phi [n, F] of all labels in float32, and d phi / d (x / scale) as nonzeros [n, nz] with their rows, columns."""
+    x, t = (ca.SX.sym(n, net.inputs.size1_in(i)) for i, n in enumerate("xt"))
+    phi = net.inputs(x, t)
+    J = ca.jacobian(phi, x)
+    rows, columns = (torch.tensor(i) for i in J.sparsity().get_triplet())
+    both = to_torch(ca.Function("both", [x, t], [ca.densify(phi), J.nz[:]]))
+    X, T = torch.from_numpy(labels.x), torch.from_numpy(labels.t)[:, None]
+    with torch.no_grad():
+        parts = [both(X[i:i + CHUNK], T[i:i + CHUNK]) for i in range(0, len(X), CHUNK)]
+    values, slopes = (torch.cat([p[i] for p in parts]) for i in range(2))
+    return values.float(), (slopes * torch.from_numpy(scale)[columns]).float(), rows, columns

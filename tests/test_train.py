@@ -1,0 +1,415 @@
+"""The default method against what is known: the Riccati solution, fine integration, problems solved again."""
+
+import importlib
+import json
+from dataclasses import replace
+
+import casadi as ca
+import numpy as np
+import pytest
+import torch
+
+import nocl
+from nocl.hjb import hjb_residual
+from nocl.integrate import rk4_interval
+from nocl.nets import MLP, FeatureNet
+from nocl.simulate import simulate
+from nocl.solvers import NMPC
+from nocl.solvers.bank import SolutionBank, extend, solve_globally
+from nocl.solvers.cnd import TrainSettings
+from nocl.solvers.cnd.features import policy_net
+from nocl.solvers.cnd.labels import Labels, answered, continuous_cost, kicked_rollout, policy_controls, tube
+from nocl.solvers.cnd.regress import fit, policy_loss
+from nocl.solvers.cnd.value import ROUND, ValueLabels, value_loss, value_net, value_solutions
+from nocl.solvers.ddp import DDP
+
+module = importlib.import_module("nocl.solvers.cnd.train")  # the package has a function of that name
+
+SMALL = TrainSettings(intervals=40, seeds=4, starts=2, states=60, tails=400, visits=200, rounds=0, iterations=800,
+                      batch=512, hidden=(24, 24), value_tails=800, value_iterations=800, held_out=16, gap_median=1e-9)
+TINY = replace(SMALL, intervals=20, batch=64, states=10, tails=40, visits=20, rounds=2, iterations=30, hidden=(8,),
+               value_tails=40, value_iterations=20, held_out=4)
+
+
+def riccati(t, T=2.0, R=0.01):
+    """S [n, 2, 2] of V = x' S x, and the gains K [n, 1, 2] of u = -K x: systems/double_integrator.py has the source."""
+    s = T - np.asarray(t, dtype=float)
+    W = np.array([[s**3 / 3, s**2 / 2], [s**2 / 2, s]]).transpose(2, 0, 1) / R
+    Phi = np.array([[np.ones_like(s), s], [np.zeros_like(s), np.ones_like(s)]]).transpose(2, 0, 1)
+    S = Phi.transpose(0, 2, 1) @ np.linalg.inv(np.eye(2) + W) @ Phi
+    return S, S[:, 1:] / R
+
+
+@pytest.fixture(scope="module")
+def integrator():
+    ocp = nocl.load_ocp("double_integrator")
+    return ocp, nocl.train(ocp, settings=SMALL, seed=0, progress=False)
+
+
+@pytest.fixture(scope="module")
+def pendulum():
+    """(ocp, ddp, bank of solutions, f): no training."""
+    ocp = nocl.load_ocp("pendulum")
+    ddp, rng = DDP(ocp, intervals=40), np.random.default_rng(0)
+    seeds = solve_globally(ddp, ocp.initial_states.sample(6, rng), starts=4, seed=rng).best
+    bank = SolutionBank.of(ddp, seeds)
+    more = extend(ddp, bank, ocp.initial_states.sample(40, rng))
+    return ocp, ddp, SolutionBank.of(ddp, more), nocl.to_torch(ocp.system.f)
+
+
+def paths(ocp, x0, nodes=21):
+    """Optimal paths of the double integrator (t [n], x [n, 2]) from x0, by the analytic feedback."""
+    x, t = ca.SX.sym("x", 2), ca.SX.sym("t")
+    s = ocp.horizon - t
+    W = ca.vertcat(ca.horzcat(s**3 / 3, s**2 / 2), ca.horzcat(s**2 / 2, s)) / 0.01
+    Phi = ca.vertcat(ca.horzcat(1, s), ca.horzcat(0, 1))
+    S = Phi.T @ ca.inv(ca.SX.eye(2) + W) @ Phi
+    run = simulate(ocp, ca.Function("lq", [x, t], [-(S[1, :] @ x) / 0.01]), x0, nodes=nodes)
+    return np.tile(run.t, len(x0)), run.x.reshape(-1, 2), run
+
+
+def test_linear_quadratic_policy_is_the_riccati_feedback(integrator):
+    ocp, cnd = integrator
+    t, x, _ = paths(ocp, ocp.initial_states.sample(20, 99))
+    _, K = riccati(t)
+    u = -np.einsum("nij,nj->ni", K, x)
+    early = t < 0.98 * ocp.horizon  # labels end half an interval before T
+    assert np.sqrt(np.mean((cnd(x, t) - u)[early] ** 2)) < 0.02 * u.std()
+
+
+def test_linear_quadratic_value_is_the_riccati_value(integrator):
+    ocp, cnd = integrator
+    t, x, _ = paths(ocp, ocp.initial_states.sample(20, 99))
+    S, _ = riccati(t)
+    V, V_x = np.einsum("ni,nij,nj->n", x, S, x), 2 * np.einsum("nij,nj->ni", S, x)
+    error = np.abs(cnd.value(x, t) - V) / V
+    assert np.median(error) < 0.005
+    assert np.mean(error[t == 0]) < 0.005
+    gradient = cnd.value_gradient(x, t)
+    off = np.linalg.norm(gradient - V_x, axis=1) / np.linalg.norm(V_x, axis=1)
+    assert np.median(off) < 0.02
+
+
+def test_linear_quadratic_cost_in_continuous_time(integrator):
+    ocp, cnd = integrator
+    x0 = ocp.initial_states.sample(20, 99)
+    S, _ = riccati([0.0])
+    best = np.einsum("ni,ij,nj->n", x0, S[0], x0)
+    gap = simulate(ocp, cnd, x0).cost / best - 1
+    assert (gap > -1e-6).all()
+    assert np.median(gap) < 0.001
+    assert gap.max() < 0.005
+    assert cnd.card["gap_median"] == pytest.approx(np.median(gap), abs=1e-3)
+
+
+def test_hjb_residual_is_small(integrator):
+    """V_t + L + V_x' f, at the trained u: small beside the running cost's mean rate J* / T."""
+    ocp, cnd = integrator
+    t, x, run = paths(ocp, ocp.initial_states.sample(20, 99))
+    inside = t < 0.95 * ocp.horizon
+    X, T = torch.from_numpy(x[inside]), torch.from_numpy(t[inside])[:, None]
+    residual = hjb_residual(cnd.value_net, nocl.to_torch(ocp.system.f), nocl.to_torch(ocp.L), X, cnd.policy(X, T), T)
+    assert residual.abs().median() < 0.02 * run.cost.mean() / ocp.horizon
+
+
+def test_a_trained_controller_exports_and_comes_back(integrator, tmp_path):
+    ocp, cnd = integrator
+    x, t = ocp.initial_states.sample(10, 3), np.linspace(0, ocp.horizon, 10)
+    policy, value = cnd.to_casadi(), cnd.value_to_casadi()
+    assert pytest.approx(cnd(x, t), rel=1e-12, abs=1e-12) == policy(x.T, t[None]).full().T
+    assert value(x.T, t[None]).full()[0] == pytest.approx(cnd.value(x, t), rel=1e-12, abs=1e-12)
+    cnd.save(tmp_path)
+    again = nocl.CND.load(tmp_path)
+    assert np.array_equal(again(x, t), cnd(x, t))
+    assert again.card == json.loads(json.dumps(cnd.card))
+
+
+@pytest.mark.slow
+def test_pendulum_swings_up():
+    ocp = nocl.load_ocp("pendulum")
+    settings = replace(SMALL, intervals=80, states=150, tails=1000, iterations=1500, hidden=(48, 48), visits=600,
+                       value_iterations=2000)
+    cnd = nocl.train(ocp, settings=settings, seed=0, progress=False)
+    x0 = ocp.initial_states.sample(20, 99)
+    ddp = DDP(ocp, intervals=320)
+    best = solve_globally(ddp, x0, starts=6).best
+    gap = simulate(ocp, cnd, x0).cost / best.cost - 1
+    assert np.median(gap) < 0.002
+    assert np.quantile(gap, 0.95) < 0.01
+    assert np.mean(np.abs(cnd.value(x0) / best.cost - 1)) < 0.01
+
+
+def test_same_seed_same_controller_and_others_differ():
+    ocp = nocl.load_ocp("pendulum")
+    runs = [nocl.train(ocp, settings=replace(TINY, rounds=1), seed=seed, progress=False) for seed in (3, 3, 4)]
+    x = ocp.initial_states.sample(8, 1)
+    assert np.array_equal(runs[0](x, 0.7), runs[1](x, 0.7))
+    assert np.array_equal(runs[0].value(x, 0.7), runs[1].value(x, 0.7))
+    assert runs[0].card["history"] == runs[1].card["history"]
+    assert not np.array_equal(runs[0](x, 0.7), runs[2](x, 0.7))
+
+
+def test_training_leaves_torch_as_it_was():
+    torch.manual_seed(5)
+    before, threads = torch.random.get_rng_state(), torch.get_num_threads()
+    nocl.train(nocl.load_ocp("double_integrator"), settings=replace(TINY, rounds=0), progress=False)
+    assert torch.equal(torch.random.get_rng_state(), before)
+    assert torch.get_num_threads() == threads
+
+
+@pytest.fixture(scope="module")
+def whole():
+    return nocl.train(nocl.load_ocp("pendulum"), settings=TINY, seed=1, progress=False)
+
+
+@pytest.mark.parametrize("stage", ["_regress", "_value"])
+def test_interrupted_and_resumed_is_the_same_run(stage, whole, tmp_path, monkeypatch):
+    ocp = whole.ocp
+    original = getattr(module._Training, stage)
+
+    def interrupted(self, *args):
+        if self.round >= 2:
+            raise KeyboardInterrupt
+        return original(self, *args)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module._Training, stage, interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            nocl.train(ocp, settings=TINY, seed=1, out=tmp_path, progress=False)
+    assert [p.name for p in tmp_path.iterdir()] == [module.CHECKPOINT]
+    monkeypatch.setattr(module._Training, "_first_labels", lambda self: pytest.fail("labels were made again"))
+    resumed = nocl.train(ocp, settings=TINY, seed=1, out=tmp_path, progress=False)
+    x = ocp.initial_states.sample(8, 1)
+    assert np.array_equal(resumed(x, 0.4), whole(x, 0.4))
+    assert np.array_equal(resumed.value(x, 0.4), whole.value(x, 0.4))
+    assert resumed.card["history"] == whole.card["history"]
+
+
+def test_a_checkpoint_of_another_run_is_left_aside(tmp_path):
+    ocp, settings = nocl.load_ocp("double_integrator"), replace(TINY, rounds=0)
+    nocl.train(ocp, settings=settings, seed=1, out=tmp_path, progress=False)
+    fresh = nocl.train(ocp, settings=settings, seed=2, progress=False)
+    again = nocl.train(ocp, settings=settings, seed=2, out=tmp_path, progress=False)
+    x = ocp.initial_states.sample(8, 1)
+    assert np.array_equal(again(x), fresh(x))
+
+
+def test_nothing_is_written_without_out(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    nocl.train(nocl.load_ocp("double_integrator"), settings=replace(TINY, rounds=0, value=False), progress=False)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("change", "message"), [
+    ({"seeds": 0}, "seeds is 0; expected a whole number of at least 1"),
+    ({"iterations": 2.5}, "iterations is 2.5"), ({"batch": True}, "batch is True"),
+    ({"lr": 0.0}, "lr is 0.0; expected a positive number"), ({"width": -1.0}, "width is -1.0"),
+    ({"kick": float("nan")}, "kick is nan"), ({"gap_p95": float("inf")}, "gap_p95 is inf"),
+    ({"rounds": -1}, "at least 0"), ({"hidden": ()}, r"hidden is \(\)"), ({"hidden": (64, 0)}, "expected widths")])
+def test_settings_are_checked(change, message):
+    with pytest.raises(ValueError, match=message):
+        TrainSettings(**change)
+
+
+def test_what_cannot_be_trained_is_refused():
+    ocp = nocl.load_ocp("pendulum")
+    with pytest.raises(ValueError, match="method is 'magic'; expected 'default' or 'paper'"):
+        nocl.train(ocp, method="magic")
+    with pytest.raises(ValueError, match=r"ocp is a System; expected a nocl\.OCP"):
+        nocl.train(ocp.system)
+    with pytest.raises(ValueError, match="settings is a dict; this method takes TrainSettings"):
+        nocl.train(ocp, settings={"seeds": 3})
+    with pytest.raises(ValueError, match="this method takes PaperSettings"):
+        nocl.train(ocp, method="paper", settings=SMALL)
+
+
+def test_dynamics_of_another_system_are_refused():
+    class Other:
+        system = nocl.load_ocp("cartpole").system
+
+    with pytest.raises(ValueError, match="dynamics has 4 states and 1 controls, pendulum has 2 and 1"):
+        nocl.train(nocl.load_ocp("pendulum"), Other())
+
+
+def test_labels_stand_at_the_middle_of_each_interval(pendulum):
+    ocp, ddp, bank, f = pendulum
+    solution = bank.solution[:3]
+    labels, K = Labels.of(solution, f), ddp.intervals
+    assert len(labels) == 3 * K
+    h = ocp.horizon / K
+    assert labels.t.reshape(3, K) == pytest.approx(np.tile((np.arange(K) + 0.5) * h, (3, 1)))
+    assert labels.weight == pytest.approx(h)
+    assert np.array_equal(labels.u.reshape(3, K, 1), solution.u)
+    nodes, u = (torch.from_numpy(z.reshape(3 * K, -1)) for z in (solution.x[:, :-1], solution.u))
+    middle = rk4_interval(f, nodes, u, h / 2, substeps=50)
+    assert labels.x == pytest.approx(middle.numpy(), abs=1e-5)
+
+
+def test_labels_of_what_failed_are_dropped(pendulum):
+    _, ddp, bank, f = pendulum
+    failed = replace(bank.solution[:3], success=np.array([True, False, True]))
+    assert len(Labels.of(failed, f)) == 2 * ddp.intervals
+    assert len(ValueLabels.of([failed, bank.solution[:1]])) * 2 == len(ValueLabels.of([bank.solution[:6]]))
+
+
+def test_tube_labels_are_optimal(pendulum):
+    """Tails that DDP solved from their parents, solved again by NMPC from many starts."""
+    ocp, ddp, bank, _ = pendulum
+    solved = tube(ddp, bank, 6, 0.25, np.random.default_rng(4))
+    assert solved.success.all()
+    assert solved.V[:, 0] == pytest.approx(solved.cost, rel=1e-12)
+    for i in range(len(solved)):
+        tail = replace(ocp, horizon=ocp.horizon - solved.t[i, 0])  # neither f nor L depends on time
+        again = NMPC(tail, ddp.intervals, starts=8).solve(solved.x[i, 0])
+        assert solved.cost[i] == pytest.approx(again.cost[0], rel=1e-5)
+        assert solved.V_x[i, 0] == pytest.approx(again.costate[0, 0], rel=1e-3, abs=1e-5)
+
+
+def test_the_better_of_two_starts_is_kept(pendulum):
+    """A policy that does nothing gives a poor start; the bank's nearest solution saves the label."""
+    ocp, ddp, bank, f = pendulum
+
+    def idle(x, t):
+        return torch.zeros(len(x), 1, dtype=x.dtype)
+
+    x, t0 = bank.solution.x[:5, 10].copy(), bank.solution.t[:5, 10].copy()
+    best = answered(ddp, bank, idle, f, x, t0)
+    near = ddp.solve(x, t0, **bank.guess(np.arange(5), t0))
+    assert (best.cost <= near.cost * (1 + 1e-4)).all()
+    u = policy_controls(idle, f, x, t0, ocp.horizon, ddp.intervals)
+    assert u.shape == (5, ddp.intervals, 1)
+    assert not u.any()
+
+
+def feedback(ocp, K=(20.0, 6.0)):
+    """u = clip(-K x - t / 10), a policy with nothing to learn, as a network."""
+    x, t, y = ca.SX.sym("x", 2), ca.SX.sym("t"), ca.SX.sym("y")
+    inputs = ca.Function("phi", [x, t], [ca.vertcat(x, t)], ["x", "t"], ["phi"])
+    clip = ca.fmin(ca.fmax(y, ocp.system.lbu[0]), ocp.system.ubu[0])
+    net = FeatureNet(inputs, [MLP([3, 1])], ca.Function("u", [x, t, y], [clip], ["x", "t", "y"], ["u"]))
+    with torch.no_grad():
+        net.nets[0].body[0].weight[:] = torch.tensor([[-K[0], -K[1], -0.1]])
+        net.nets[0].body[0].bias[:] = 0
+    return net.double().requires_grad_(False)
+
+
+def test_kicked_rollout(pendulum):
+    ocp, _, _, f = pendulum
+    policy, x0 = feedback(ocp), np.array([[0.3, 0.0], [0.1, -0.2]])
+    t, x = kicked_rollout(ocp, policy, f, x0, np.zeros(2), np.random.default_rng(0), steps=320)
+    run = simulate(ocp, nocl.CND(ocp, policy), x0, nodes=321)
+    assert t == pytest.approx(run.t)
+    assert x == pytest.approx(run.x, abs=0.01)  # held over 320 intervals, half an interval late
+    _, kicked = kicked_rollout(ocp, policy, f, x0, np.array([0.0, 0.1]), np.random.default_rng(0), steps=320)
+    _, again = kicked_rollout(ocp, policy, f, x0, np.array([0.0, 0.1]), np.random.default_rng(0), steps=320)
+    assert np.array_equal(kicked, again)
+    assert np.array_equal(kicked[:, 0], x0)
+    assert np.abs(kicked - x).max() > 0.01
+
+
+def test_continuous_cost_is_the_judges(pendulum):
+    ocp, _, _, f = pendulum
+    policy, x0 = feedback(ocp), np.array([[0.2, 0.0], [0.1, -0.2], [-0.15, 0.3]])  # U is not reached: smooth
+    run = simulate(ocp, nocl.CND(ocp, policy), x0)
+    assert run.saturation.max() == 0
+    assert continuous_cost(ocp, policy, f, x0, 400) == pytest.approx(run.cost, rel=1e-6)
+
+
+def loss_parts(u_label):
+    """u -> (policy loss where the network answers u, its slope, one unit of u in the network's); U = [-5, 5]."""
+    ocp = nocl.load_ocp("pendulum")
+    rng = np.random.default_rng(0)
+    n = len(u_label)
+    labels = Labels(rng.standard_normal((n, 2)), rng.uniform(0, 3, n), np.array(u_label)[:, None], np.ones(n))
+    net, inverse = policy_net(ocp, labels, (4,))
+    answer = torch.nn.Linear(1, 1)  # stands for the network: whatever the features, it answers `y`
+    answer.y = None
+    answer.forward = lambda phi: answer.y
+    net.nets[0] = answer
+    net.float()
+    loss = policy_loss(ocp, net, inverse, labels)
+    to_y = nocl.to_torch(inverse)
+
+    def of(u):
+        y = to_y(torch.tensor(u, dtype=torch.float64)[:, None]).float().requires_grad_(True)
+        answer.y = y
+        value = loss(torch.arange(n))
+        (slope,) = torch.autograd.grad(value, y)
+        return value.item(), slope[:, 0].numpy(), float((to_y(torch.ones(1, 1)) - to_y(torch.zeros(1, 1))).item())
+
+    return of
+
+
+def test_policy_loss_counts_what_costs():
+    wanted = [-5.0, 5.0, 1.0, -2.0]
+    of = loss_parts(wanted)
+    value, slope, _ = of(wanted)
+    assert value == pytest.approx(0, abs=1e-10)
+    assert slope == pytest.approx(np.zeros(4), abs=1e-5)
+    value, slope, _ = of([-9.0, 7.0, 1.0, -2.0])  # beyond bounds that are active in the labels
+    assert value == pytest.approx(0, abs=1e-10)
+    assert slope == pytest.approx(np.zeros(4), abs=1e-5)
+    value, slope, unit = of([-4.0, 4.0, 1.5, -2.5])
+    off = unit * np.array([1.0, -1.0, 0.5, -0.5])  # in the network's units
+    assert value == pytest.approx((off**2).mean(), rel=1e-4)
+    assert slope == pytest.approx(2 * off / 4, rel=1e-4)
+
+
+def test_value_labels_are_costs_to_go_on_the_fine_grid(pendulum):
+    ocp, ddp, bank, f = pendulum
+    fine = DDP(ocp, intervals=160)
+    whole, tails = value_solutions(ddp, fine, bank, feedback(ocp), f, 12, 0.25, np.random.default_rng(0))
+    assert len(whole) == len(bank)
+    assert (whole.cost <= bank.solution.cost).all()  # what is held for shorter costs less
+    labels = ValueLabels.of([whole, tails])
+    end = labels.t > ocp.horizon - 1e-9
+    assert end.sum() == whole.success.sum() + tails.success.sum()
+    G = ocp.G(labels.x[end].T).full()[0]
+    assert labels.V[end] == pytest.approx(G, rel=1e-9)
+    assert labels.V_x[end] == pytest.approx(2 * labels.x[end], rel=1e-9)
+
+
+def riccati_labels(n=4000, shift=0.0):
+    rng = np.random.default_rng(0)
+    t, x = rng.uniform(0, 2, n), rng.standard_normal((n, 2))
+    S, _ = riccati(t)
+    return ValueLabels(x, t, np.einsum("ni,nij,nj->n", x, S, x) + shift, 2 * np.einsum("nij,nj->ni", S, x))
+
+
+@pytest.mark.parametrize("shift", [0.0, -3.0])
+def test_value_regression_on_exact_labels(shift):
+    """Positive costs and costs of both signs alike."""
+    ocp, labels = nocl.load_ocp("double_integrator"), riccati_labels(shift=shift)
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        net = value_net(ocp, labels, (24, 24))
+    fit(net, value_loss(net, labels, np.ones(2)), len(labels), iterations=600, batch=512, lr=4e-3, seed=0)
+    cnd = nocl.CND(ocp, feedback(ocp), net)
+    size = labels.V - min(0.0, labels.V.min())
+    error = np.abs(cnd.value(labels.x, labels.t) - labels.V) / (size + 0.1 * np.median(size))
+    assert np.median(error) < (0.03 if shift else 0.01)
+    if shift == 0:
+        assert cnd.value(labels.x, labels.t).min() >= 0
+
+
+def test_value_loss_has_the_right_gradients():
+    """The gradient that the loss sees, assembled from those of the features, is autograd's own dV/dx."""
+    ocp, labels = nocl.load_ocp("pendulum"), riccati_labels(50)
+    torch.manual_seed(0)
+    net = value_net(ocp, labels, (8,)).float()
+    exact = nocl.CND(ocp, feedback(ocp), value_net(ocp, labels, (8,)))
+    exact.value_net.load_state_dict({k: v.double() for k, v in net.state_dict().items()})
+    own = ValueLabels(labels.x, labels.t, exact.value(labels.x, labels.t), exact.value_gradient(labels.x, labels.t))
+    rows = torch.arange(50)
+    at_own = value_loss(net, own, np.array([0.5, 2.0]))(rows).item()
+    assert at_own == pytest.approx(ROUND, rel=1e-3)  # its least value
+    for wrong in (replace(own, V_x=own.V_x * [1.0, 1.2]), replace(own, V=own.V * 1.1)):
+        assert value_loss(net, wrong, np.array([0.5, 2.0]))(rows).item() > 2 * at_own
+
+
+def test_a_loss_that_is_not_finite_stops_the_fit():
+    ocp = nocl.load_ocp("double_integrator")
+    labels = riccati_labels(10)
+    net = value_net(ocp, labels, (4,))
+    with pytest.raises(ValueError, match="the loss is nan at iteration 0: lower the learning rate"):
+        fit(net, lambda rows: net.nets[0].body[0].weight.sum() * torch.nan, 10, iterations=3, batch=2, lr=1e-3, seed=0)
