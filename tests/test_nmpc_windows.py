@@ -216,3 +216,17 @@ def test_mirror_images_and_sides():
     x0 = np.array([[-3.0, 0.7, 0.4], [-3.0, -0.7, -0.4]])
     images = NMPC(ocp, 40, starts=3).solve(x0)
     assert images.cost[0] == pytest.approx(images.cost[1], rel=1e-6)
+
+
+@pytest.mark.slow
+def test_a_closed_loop_is_a_method_of_compare():
+    """Beside open loop: the same cost on the exact plant, and no failed step."""
+    from nocl.comparisons import compare
+
+    ocp = nocl.load_ocp("pendulum")
+    nmpc = NMPC(ocp, 40, starts=4)
+    loop = nmpc.controller()
+    report = compare(ocp, {"open": nmpc, "closed": loop}, n=3, hold=40, progress=False)
+    costs = [[row["cost"] for row in report.rows() if row["method"].startswith(name)] for name in ("open", "closed")]
+    assert costs[1] == pytest.approx(costs[0], rel=5e-3)
+    assert loop.failures == 0
