@@ -157,8 +157,8 @@ def test_pretrained_names_what_there_is(monkeypatch, tmp_path, cnd):
         package.pretrained("nonesuch")
     with pytest.raises(ValueError, match="expected 'exact' or 'learned'"):
         package.pretrained("cartpole", dynamics="true")
-    monkeypatch.setattr("nocl.solvers.cnd.controller.PRETRAINED", tmp_path)
-    cnd.save(tmp_path / "pendulum-learned")
+    monkeypatch.setattr("nocl.solvers.cnd.controller.files", lambda package: tmp_path)
+    cnd.save(tmp_path / "pretrained" / "pendulum-learned")
     with pytest.raises(ValueError, match="there are: pendulum-learned"):
         package.pretrained("pendulum")
     x = cnd.ocp.initial_states.sample(2, 0)

@@ -34,7 +34,7 @@ def fit(net: FeatureNet, loss: Loss, rows: int, *, iterations: int, batch: int, 
         optimizer.param_groups[0]["lr"] = lr * min(1.0, (i + 1) / 50) * _cosine(i / iterations)
         value = loss(torch.randint(rows, (batch,), generator=generator))
         if i % 100 == 0 and not torch.isfinite(value):
-            raise ValueError(f"the loss is {float(value)} at iteration {i}: lower the learning rate (lr is {lr:g})")
+            raise ValueError(f"the loss is {value.item()} at iteration {i}: lower the learning rate (lr is {lr:g})")
         optimizer.zero_grad()
         value.backward()
         optimizer.step()
