@@ -28,6 +28,7 @@ from nocl.nets import ACTIVATIONS, MLP, FeatureNet
 from nocl.sampling import Seed
 from nocl.structure import Box, Expansion, Group, Oracle, Split, Structure
 from nocl.system import System
+from nocl.threads import one_thread
 from nocl.to_casadi import to_casadi
 
 METHODS = ("default", "mlp", "paper")
@@ -200,6 +201,7 @@ def load_dynamics(folder: str | Path) -> LearnedDynamics:
     return LearnedDynamics.load(folder)
 
 
+@one_thread()
 def identify(system: System, *, data: Dataset | None = None, method: str = "default", gradients: bool = True,
              seed: int = 0, settings: Settings | PaperSettings | None = None, progress: bool = True,
              checkpoint: str | Path | None = None) -> LearnedDynamics:

@@ -36,6 +36,7 @@ from nocl.solvers.cnd.labels import Labels, continuous_cost, tube, visited
 from nocl.solvers.cnd.regress import fit, policy_loss
 from nocl.solvers.cnd.value import ValueLabels, value_loss, value_net, value_solutions
 from nocl.solvers.ddp import DDP
+from nocl.threads import one_thread
 from nocl.to_torch import to_torch
 
 if TYPE_CHECKING:
@@ -137,7 +138,7 @@ class _Training:
         self.round, self.history, self.seconds = 0, [dict[str, Any]() for _ in range(0)], 0.0
 
     def run(self) -> CND:
-        with _one_thread():
+        with one_thread():
             return self._run()
 
     def _run(self) -> CND:
@@ -279,17 +280,6 @@ def _reporter(bar: tqdm[Any]) -> Any:
 
 
 @contextmanager
-def _one_thread() -> Iterator[None]:
-    """torch on one thread: with matrices as small as these, threads cost more than they give."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
-@contextmanager
 def _seeded(seed: int) -> Iterator[None]:
     """torch's own generator at a seed, and back to where it was afterwards."""
     with torch.random.fork_rng(devices=[]):
@@ -300,7 +290,7 @@ def _seeded(seed: int) -> Iterator[None]:
 def _fingerprint(f: Any) -> float:
     """A number that tells one learned model from another; 0 for the exact f."""
     net = getattr(f, "net", None)
-    return 0.0 if net is None else float(sum(p.double().abs().sum() for p in net.parameters()))
+    return 0.0 if net is None else float(sum(p.detach().double().abs().sum() for p in net.parameters()))
 
 
 def _tensors(arrays: dict[str, Any]) -> dict[str, torch.Tensor]:
