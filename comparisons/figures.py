@@ -83,7 +83,7 @@ def gaps(report: Report) -> Figure:
         ax.text(x, 2, f" {text}", color="0.4", fontsize=8)
     ax.set(xlabel="gap to the best known cost of the state [%]", ylabel="initial states [%]", ylim=(0, 103))
     ax.set_xlim(-SMALL_GAP / 5, right)
-    ax.legend(loc="center right")
+    figure.legend(loc="outside upper center", ncols=min(len(report.judged), 4))
     return figure
 
 

@@ -22,7 +22,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nocl import checks
+from nocl import checks, interrupt
 from nocl.checks import Array
 from nocl.ocp import OCP
 
@@ -316,7 +316,8 @@ class _Step:
 def _integrate(solver: ca.Function, z: Any, p: Any) -> tuple[Array | None, float]:
     """(states at the solver's times, last quadrature), or None where CVODES fails or yields NaN."""
     try:
-        result = solver(x0=z, p=p)
+        with interrupt.deferred():
+            result = solver(x0=z, p=p)
     except RuntimeError:
         return None, np.nan
     end, quad = result["xf"].full(), result["qf"].full()

@@ -16,6 +16,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from nocl import interrupt
 from nocl.checks import Array
 from nocl.integrate import rk4_cost, rk4_interval
 from nocl.ocp import OCP
@@ -168,8 +169,10 @@ class Transcription:
     def solve(self, x0: Array, t: Array, x: Array, u: Array) -> Answer:
         """Solve from x0 on the nodes t [N+1] with the guess x [N+1, nx], u [N, nu]."""
         w0 = np.r_[np.c_[x[:-1], u].ravel(), x[-1]]
-        result = self.solver(x0=w0, p=np.r_[x0, np.diff(t), t[-1]], **self.bounds)
-        stats = self.solver.stats()
+        solver, p = self.solver, np.r_[x0, np.diff(t), t[-1]]
+        with interrupt.deferred():
+            result = solver(x0=w0, p=p, **self.bounds)
+        stats = solver.stats()
         X, U = (v.full().T for v in self.split(result["x"]))
         U = np.clip(U, self.ocp.system.lbu, self.ocp.system.ubu)  # IPOPT relaxes bounds by 1e-8
         costate = -result["lam_g"].full().ravel()[self.gap_rows]

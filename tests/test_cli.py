@@ -1,4 +1,4 @@
-"""The command line: bad input is one line, exit code 2, nothing written; a run's stages are taken up where they stand."""
+"""The command line: bad input is one line, exit code 2, nothing written; a run's stages go on from where they stand."""
 
 import json
 import os
