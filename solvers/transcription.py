@@ -160,6 +160,11 @@ class Transcription:
                 "lbg": np.zeros(len(ubg)), "ubg": ubg}
 
     @cached_property
+    def _limits(self) -> dict[str, ca.DM]:
+        """The bounds as CasADi takes them: converting them at each solve would take a millisecond."""
+        return {name: ca.DM(value) for name, value in self.bounds.items()}
+
+    @cached_property
     def gap_rows(self) -> Array:
         """Where x_0 - p and the gaps stand in g, [N+1, nx]."""
         s, N, m = self.ocp.system, self.N, self.n_path
@@ -171,7 +176,7 @@ class Transcription:
         w0 = np.r_[np.c_[x[:-1], u].ravel(), x[-1]]
         solver, p = self.solver, np.r_[x0, np.diff(t), t[-1]]
         with interrupt.deferred():
-            result = solver(x0=w0, p=p, **self.bounds)
+            result = solver(x0=w0, p=p, **self._limits)
         stats = solver.stats()
         X, U = (v.full().T for v in self.split(result["x"]))
         U = np.clip(U, self.ocp.system.lbu, self.ocp.system.ubu)  # IPOPT relaxes bounds by 1e-8
