@@ -6,7 +6,7 @@ The default method regresses the controller on optimal answers, and never differ
 2. optimal tails from a tube about these trajectories, all by batched DDP on the dynamics that training uses;
 3. regression of u(x, t) on the middle of every interval, so that the controller is feedback in continuous time;
 4. rounds: the states that the controller visits under kicks are solved too and added (DAgger, Ross et al. 2011), until
-   it meets the wanted gap on held-out initial states or the rounds are used up;
+   it meets the wanted gap on held-out initial states (after two rounds at least) or the rounds are used up;
 5. V(x, t) by regression on the costs-to-go and their gradients, the costates.
 """
 
@@ -59,7 +59,8 @@ class TrainSettings:
     visits: int = 2000  # visited states solved in each round
     kick: float = 0.1  # pushes on the visiting policy, in units of each state's spread
     rounds: int = 3  # of visited states, at most
-    iterations: int = 2000  # of the first regression; each round adds as many, the last one twice as many
+    least_rounds: int = 2  # and at least: the gap is met sooner than under disturbances
+    iterations: int = 2000  # of each regression; twice as many from the round on that may be the last
     batch: int = 1024
     lr: float = 4e-3
     hidden: tuple[int, ...] = (64, 64, 64)
@@ -72,7 +73,7 @@ class TrainSettings:
 
     def __post_init__(self) -> None:
         for f in fields(self):
-            value, least = getattr(self, f.name), 0 if f.name in ("rounds", "states", "tails") else 1
+            value, least = getattr(self, f.name), 0 if f.name in ("rounds", "least_rounds", "states", "tails") else 1
             if f.type == "int" and (isinstance(value, bool) or not isinstance(value, int) or value < least):
                 raise ValueError(f"TrainSettings: {f.name} is {value!r}; expected a whole number of at least {least}")
             if f.type == "float" and not (isinstance(value, (int, float)) and 0 < value < float("inf")):
@@ -149,7 +150,7 @@ class _Training:
         while self.round <= s.rounds and not self._good_enough():
             if self.round:
                 self._visit()
-            self._regress(2 * s.iterations if self.round == s.rounds and s.rounds else s.iterations)
+            self._regress(s.iterations * (2 if self.round >= max(s.least_rounds, 1) else 1))
             self._validate()
             self.round += 1
             self._save()
@@ -207,8 +208,10 @@ class _Training:
                              "gap_p95": float(p95)})
 
     def _good_enough(self) -> bool:
-        last, s = self.history[-1] if self.history else None, self.settings
-        return last is not None and last["gap_median"] <= s.gap_median and last["gap_p95"] <= s.gap_p95
+        if self.round <= self.settings.least_rounds:
+            return False
+        last, s = self.history[-1], self.settings
+        return bool(last["gap_median"] <= s.gap_median and last["gap_p95"] <= s.gap_p95)
 
     def _value(self) -> FeatureNet:
         s, rng = self.settings, self._rng(2_000_000)
