@@ -216,7 +216,7 @@ def _elu(layer: nn.ELU, x: ca.MX, place: str) -> ca.MX:
     return ca.if_else(x > 0, x, layer.alpha * ca.expm1(ca.if_else(x > 0, 0, x)))
 
 
-def _sigmoid(x: ca.MX) -> ca.MX:
+def sigmoid(x: ca.MX) -> ca.MX:
     return 0.5 * (1 + ca.tanh(x / 2))  # exp(-x) overflows in the derivative
 
 
@@ -227,7 +227,7 @@ RULES: dict[type[nn.Module], Rule] = {
     nn.Tanh: lambda layer, x, place: ca.tanh(x),
     nn.ReLU: lambda layer, x, place: ca.if_else(x > 0, x, 0),
     nn.LeakyReLU: lambda layer, x, place: ca.if_else(x > 0, x, layer.negative_slope * x),
-    nn.Sigmoid: lambda layer, x, place: _sigmoid(x),
-    nn.SiLU: lambda layer, x, place: x * _sigmoid(x),
+    nn.Sigmoid: lambda layer, x, place: sigmoid(x),
+    nn.SiLU: lambda layer, x, place: x * sigmoid(x),
     nn.Softplus: _softplus, nn.GELU: _gelu, nn.ELU: _elu,
 }
