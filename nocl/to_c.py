@@ -8,13 +8,18 @@ The folder gets, for a function NAME:
     NAME_vectors.csv   inputs in the box, corners among them, and CasADi's outputs
     NAME_test.c        a main that holds NAME against these vectors
     Makefile           `make check` builds and runs every self-test of the folder
+    README.md          what stands in the folder, how to call it, how to compile it for a microcontroller
+
+`load(folder)` compiles it and calls it back.
 """
 
 from __future__ import annotations
 
+import ctypes
 import os
 import re
 import shutil
+import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -30,7 +35,8 @@ from nocl import checks
 from nocl.checks import Array
 
 MARK = "written by nocl.to_c"  # stands in the first line of every file: only such files are overwritten
-TOLERANCE = {"float64": 1e-12, "float32": 1e-5}  # of the self-test, relative to max(1, |output|)
+# of the self-test, relative to what _scales says
+TOLERANCE = {"float64": 1e-12, "float32": 1e-5}
 REAL = {"float64": "double", "float32": "float"}
 RESERVED = frozenset((
     "auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern", "float",
@@ -88,13 +94,94 @@ def to_c(function: ca.Function, folder: str | Path, name: str | None = None, *, 
         bad = z[~np.isfinite(values).all(axis=1)][0]
         raise ValueError(f"to_c: {name} is NaN or inf at {bad.tolist()}; expected finite values in the box: shrink its "
                          "bounds")
+    vectors = z, values, _scales(function, inputs, z, values, dtype)
     files = {f"{name}.h": _header(name, inputs, outputs, REAL[dtype], note),
              f"{name}.c": _source(name, inputs, outputs, REAL[dtype], sizes),
              f"{name}_casadi.c": _first_line(f"{name}_casadi.c") + code,
              f"{name}_vectors.csv": _csv(name, inputs, outputs, z, values),
-             f"{name}_test.c": _self_test(name, inputs, outputs, z, values, dtype),
+             f"{name}_test.c": _self_test(name, inputs, outputs, vectors, dtype),
              "Makefile": MAKEFILE}
-    return _put(Path(folder), files)
+    return _put(Path(folder), files | {"README.md": _readme(Path(folder), files[f"{name}.h"], name)})
+
+
+class Compiled:
+    """A compiled function of nocl's, called back: rows in, rows out (float64), whatever it computes in.
+
+    `compiled(x, t)` takes each input as a column [n] (a number where it is a scalar) and gives a list of outputs [n],
+    or the only one; with rows [B, n] it gives rows [B, n]. `name`, `inputs`, `outputs` ({name: length}), `dtype`.
+    """
+
+    def __init__(self, header: Path, library: Path) -> None:
+        text = header.read_text(encoding="utf-8")
+        found = re.search(r"^int (\w+)\((.*)\);$", text, re.MULTILINE)
+        if MARK not in text.split("\n", 1)[0] or found is None:
+            raise ValueError(f"to_c.load: {header} was not written by nocl; expected the header of to_c")
+        self.name, declared = found[1], [a.rsplit(" ", 1) for a in found[2].split(", ")]
+        size = {a.lower(): int(n) for a, n in re.findall(rf"#define {self.name.upper()}_N_(\w+) (\d+)", text)}
+        lengths = {name.lstrip("*"): size[name.lstrip("*").lower()] for _, name in declared}
+        self.outputs = {k.lstrip("*"): lengths[k.lstrip("*")] for t, k in declared
+                        if k.startswith("*") and not t.startswith("const")}
+        self.inputs = {k: n for k, n in lengths.items() if k not in self.outputs}
+        self.dtype = "float64" if declared[0][0].split()[-1] == "double" else "float32"
+        real = ctypes.c_double if self.dtype == "float64" else ctypes.c_float
+        self.function = getattr(ctypes.CDLL(str(library)), self.name)
+        self.function.restype = ctypes.c_int
+        self.function.argtypes = [ctypes.c_void_p if k.startswith("*") else real for _, k in declared]
+        self._scalar = [not k.startswith("*") for _, k in declared][:len(self.inputs)]
+
+    def __call__(self, *args: ArrayLike) -> Any:
+        """The outputs at one point or at rows; ValueError for arguments that do not fit."""
+        given = [np.asarray(a, dtype=np.float64) for a in args]
+        single = all(a.ndim < 2 for a in given)
+        B = max((len(a) for a in given if a.ndim == 2), default=1)
+        rows = [self._rows(a, n, B) for a, n in zip(given, self._lengths(len(given)), strict=True)]
+        results = [np.empty((B, n), self.dtype) for n in self.outputs.values()]
+        for i in range(B):
+            row = [float(a[i, 0]) if scalar else a[i].ctypes.data for a, scalar in zip(rows, self._scalar, strict=True)]
+            self.function(*row, *(r[i].ctypes.data for r in results))
+        answers = [r[0].astype(np.float64) if single else r.astype(np.float64) for r in results]
+        return answers[0] if len(answers) == 1 else answers
+
+    def _lengths(self, n: int) -> list[int]:
+        if n != len(self.inputs):
+            raise ValueError(f"{self.name}: got {n} arguments; expected {len(self.inputs)}: {', '.join(self.inputs)}")
+        return list(self.inputs.values())
+
+    def _rows(self, a: Array, n: int, B: int) -> Array:
+        if n == 1 and a.shape == (B,):
+            a = a[:, None]  # one number for each row
+        rows = np.broadcast_to(a, (B, n)) if a.shape in ((), (n,)) else a
+        if rows.shape != (B, n):
+            raise ValueError(f"{self.name}: an argument has shape {a.shape}; expected [{n}] or [{B}, {n}], for "
+                             f"{', '.join(self.inputs)}")
+        return np.ascontiguousarray(rows, self.dtype)
+
+
+def load(folder: str | Path, name: str | None = None, *, compiler: str = "cc",
+         flags: Sequence[str] = ("-O2", "-std=c99")) -> Compiled:
+    """The function that to_c wrote in `folder`, compiled and loaded by ctypes; nothing is written to the folder.
+
+    name: which one, where the folder holds several. Raises ValueError for a missing compiler, a folder without such a
+    function, and code that does not compile.
+    """
+    folder = Path(folder)
+    there = {p.stem: p for p in sorted(folder.glob("*.h")) if (folder / f"{p.stem}_casadi.c").is_file()}
+    if name is None and len(there) == 1:
+        name = next(iter(there))
+    if name is None or name not in there:
+        raise ValueError(f"to_c.load: {folder} holds {', '.join(there) or 'no function of to_c'}; got name={name!r}: "
+                         "name one of them")
+    with tempfile.TemporaryDirectory(prefix="nocl_c_") as build:  # a loaded library needs its file no longer
+        library = Path(build) / f"{name}.so"
+        command = [compiler, *flags, "-shared", "-fPIC", str(folder / f"{name}.c"), "-o", str(library), "-lm"]
+        try:
+            result = subprocess.run(command, capture_output=True, text=True, check=False)
+        except OSError as error:
+            raise ValueError(f"to_c.load: the compiler {compiler!r} cannot be run ({error.strerror}): install gcc, or "
+                             "pass another `compiler`") from error
+        if result.returncode:
+            raise ValueError(f"to_c.load: {compiler} refuses {folder / f'{name}.c'}: {result.stderr.strip()[-500:]}")
+        return Compiled(there[name], library)
 
 
 # The function and its arguments
@@ -185,6 +272,21 @@ def _samples(boxes: Sequence[tuple[Array, Array]], n: int, seed: int) -> Array:
     return np.clip(lower + share * (upper - lower), lower, upper)
 
 
+def _scales(function: ca.Function, inputs: Sequence[_Argument], z: Array, values: Array, dtype: str) -> Array:
+    """What the self-test's errors are relative to, [N, outputs].
+
+    float64: max(1, |output|). float32: the largest output of all vectors (at least 1), and what a change of the inputs,
+    relative to their largest, makes of the output, sum_j |d output / d input_j| max |input_j|: no code is better than
+    the digits of its numbers.
+    """
+    if dtype == "float64":
+        return np.maximum(1, np.abs(values))
+    v = ca.MX.sym("z", z.shape[1])
+    y = ca.vertcat(*function.call(ca.vertsplit(v, [0, *np.cumsum([a.n for a in inputs]).tolist()])))
+    size = ca.Function("size", [v], [ca.densify(ca.mtimes(ca.fabs(ca.jacobian(y, v)), np.abs(z).max(axis=0)))])
+    return np.fmax(max(1.0, np.abs(values).max()), size.map(len(z))(z.T).full().T)
+
+
 def _split(z: Array, inputs: Sequence[_Argument]) -> list[Array]:
     return [part.T for part in np.split(z, np.cumsum([a.n for a in inputs])[:-1], axis=1)]
 
@@ -253,8 +355,9 @@ def _csv(name: str, inputs: Sequence[_Argument], outputs: Sequence[_Argument], z
     return _first_line(f"{name}_vectors.csv", ("# ", "")) + "\n".join([",".join(titles), *lines, ""])
 
 
-def _self_test(name: str, inputs: Sequence[_Argument], outputs: Sequence[_Argument], z: Array, values: Array,
+def _self_test(name: str, inputs: Sequence[_Argument], outputs: Sequence[_Argument], vectors: tuple[Array, ...],
                dtype: str) -> str:
+    z, values, scales = vectors
     real, n_in, n_out = REAL[dtype], z.shape[1], values.shape[1]
     place = np.cumsum([0, *(a.n for a in inputs)])
     got = np.cumsum([0, *(a.n for a in outputs)])
@@ -267,13 +370,14 @@ def _self_test(name: str, inputs: Sequence[_Argument], outputs: Sequence[_Argume
     return "\n".join([
         _first_line(f"{name}_test.c") + f'#include "{name}.h"', "#include <math.h>", "#include <stdio.h>", "",
         f"static const double inputs[{len(z)}][{n_in}] = {{", rows(z), "};",
-        f"static const double expected[{len(z)}][{n_out}] = {{", rows(values), "};", "",
+        f"static const double expected[{len(z)}][{n_out}] = {{", rows(values), "};",
+        "/* what the error is relative to */", f"static const double scale[{len(z)}][{n_out}] = {{", rows(scales), "};",
+        "",
         "int main(void) {", f"  const double limit = {TOLERANCE[dtype]!r};", "  double worst = 0;",
         "  int i, j, bad = 0, worst_at = 0;", f"  for (i = 0; i < {len(z)}; ++i) {{",
         f"    {real} z[{n_in}], y[{n_out}];", f"    for (j = 0; j < {n_in}; ++j) z[j] = ({real})inputs[i][j];",
         f"    if ({name}({', '.join(call)})) return 2;", f"    for (j = 0; j < {n_out}; ++j) {{",
-        "      const double scale = fabs(expected[i][j]) > 1 ? fabs(expected[i][j]) : 1;",
-        "      const double error = fabs((double)y[j] - expected[i][j]) / scale;",
+        "      const double error = fabs((double)y[j] - expected[i][j]) / scale[i][j];",
         "      if (!(error <= limit)) bad = 1;  /* NaN too */",
         "      if (error > worst) { worst = error; worst_at = i; }",
         "    }", "  }",
@@ -297,6 +401,34 @@ clean:
 
 .PHONY: check clean
 """
+
+
+README = """<!-- README.md, {mark} -->
+# C code of {names}
+
+C99 without dependencies but `<math.h>`: no heap, no globals, re-entrant. Inputs and outputs are in physical units;
+each header says which, with their bounds.
+
+{list}
+
+- `make check` compiles every self-test with `-Wall -Wextra -Werror -pedantic` and holds it against its test vectors
+  (`*_vectors.csv`: inputs, and outputs as CasADi computes them in float64; corners of the box first).
+- On a microcontroller: `arm-none-eabi-gcc -mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16 -Os
+  -ffunction-sections -fstack-usage -c NAME.c`, link with `-Wl,--gc-sections -lm`. A processor with single-precision
+  floating point wants code that was written with dtype="float32". The workspace is on the stack: the `.su` file
+  tells how much.
+- From Python: `nocl.to_c.load(folder, "NAME")` compiles it and returns a callable.
+"""
+
+
+def _readme(folder: Path, header: str, name: str) -> str:
+    """README.md of all functions that stand in the folder, and of this one."""
+    headers = {path.stem: path.read_text(encoding="utf-8", errors="replace") for path in folder.glob("*.h")}
+    lines = {}
+    for stem, text in sorted((headers | {name: header}).items()):
+        if MARK in text.split("\n", 1)[0] and (declared := re.search(r"^int \w+\(.*\);$", text, re.MULTILINE)):
+            lines[stem] = f"- `{stem}.h`: `{declared[0]}`"
+    return README.format(mark=MARK, names=", ".join(lines), list="\n".join(lines.values()))
 
 
 def _put(folder: Path, files: Mapping[str, str]) -> Path:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -17,8 +17,10 @@ from nocl import checks, store
 from nocl.checks import Array
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
+from nocl.parity import Certificate, Part
 from nocl.simulate import dynamics_function
 from nocl.to_casadi import to_casadi
+from nocl.to_torch import to_torch
 
 KIND = "cnd"  # the name of its file in a folder
 Build = str | os.PathLike[str] | None  # a folder for what L4CasADi compiles
@@ -94,15 +96,42 @@ class CND:
         x, t = pi.mx_in()
         return ca.Function("closed_loop", [x, t], [ca.densify(f(x, pi(x, t)))], ["x", "t"], ["xdot"])
 
-    def to_c(self, folder: str | os.PathLike[str]) -> Path:
-        """C99 source, header, test vectors and self-test of the controller in `folder`; returns it."""
-        from nocl.to_c import to_c
+    def parts(self) -> list[Part]:
+        """What is exported: policy, gain and closed loop, and value and value gradient where it has a value."""
+        s, policy, value, f = self.ocp.system, self.policy, self.value_net, to_torch(self.ocp.system.f)
+        box = {"x": (s.lbx, s.ubx), "t": (0.0, self.ocp.horizon)}
+        x, u = ({"x": [s.unit(n) for n in s.state_names]}, [s.unit(n) for n in s.control_names])
+        slopes = [f"d {i} / d {j}" for i in s.control_names for j in s.state_names]
+        made = [Part("policy", self.to_casadi(), policy, box | {"u": (s.lbu, s.ubu)}, x | {"u": u}, policy),
+                Part("gain", self.gain_to_casadi(), lambda x, t: _slopes(policy, x, t), box, x | {"K": slopes}),
+                Part("closed_loop", self.closed_loop_to_casadi(), lambda x, t: f(x, policy(x, t)), box,
+                     x | {"xdot": [f"d {i} / dt" for i in s.state_names]})]
+        if value is not None:
+            made += [Part("value", self.value_to_casadi(), value, box, x | {"V": ["cost-to-go"]}, value),
+                     Part("value_gradient", self.value_gradient_to_casadi(), lambda x, t: _slopes(value, x, t), box,
+                          x | {"V_x": [f"d V / d {i}" for i in s.state_names]})]
+        return made
 
-        s = self.ocp.system
-        return to_c(self.to_casadi(), Path(folder), f"{s.name}_policy",
-                    bounds={"x": (s.lbx, s.ubx), "t": (0.0, self.ocp.horizon), "u": (s.lbu, s.ubu)},
-                    labels={"x": [s.unit(n) for n in s.state_names], "u": [s.unit(n) for n in s.control_names]},
-                    note=repr(self))
+    def to_c(self, folder: str | os.PathLike[str], *, dtype: str = "float64",
+             only: Sequence[str] | None = None) -> Path:
+        """C99 of the controller, its linear gain, the value and its gradient in `folder`; returns it.
+
+        Each with header, test vectors and self-test, as SYSTEM_policy, SYSTEM_gain, ...; dtype "float64" or "float32";
+        only: names of `parts()`.
+        """
+        there = {part.name: part for part in self.parts()}
+        wanted = [n for n in there if n != "closed_loop"] if only is None else list(only)
+        for name in wanted:
+            if name not in there:
+                raise ValueError(f"to_c: only has {name!r}; expected names of {', '.join(there)}")
+            there[name].to_c(Path(folder), self.ocp.system.name, dtype=dtype, note=repr(self))
+        return Path(folder)
+
+    def export(self, folder: str | os.PathLike[str], to: Sequence[str] = ("casadi",), **options: Any) -> Certificate:
+        """Files of all `parts()` in `folder`, proven equal to this controller: see nocl.export.export."""
+        from nocl.export import export
+
+        return export(self, folder, to, **options)
 
     def save(self, folder: str | os.PathLike[str]) -> Path:
         """Write controller, value, problem and card as one data-only file in `folder`."""
@@ -142,6 +171,14 @@ class CND:
     def _export(self, net: FeatureNet, name: str, out: str, backend: str, build_dir: Build) -> ca.Function:
         return to_casadi(net, backend=backend, name=name, build_dir=None if build_dir is None else Path(build_dir),
                          in_names=["x", "t"], out_names=[out])
+
+
+def _slopes(net: FeatureNet, x: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+    """d net / dx [B, n_out * nx], row by row, differentiable."""
+    with torch.enable_grad():
+        x = x if x.requires_grad else x.detach().requires_grad_(True)
+        y = net(x, t)
+        return torch.cat([torch.autograd.grad(y[:, i].sum(), x, create_graph=True)[0] for i in range(y.shape[1])], 1)
 
 
 def pretrained(name: str, dynamics: str = "exact") -> CND:

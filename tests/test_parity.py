@@ -1,0 +1,142 @@
+"""The certificate tells what differs and where; an export that is not the trained one leaves nothing behind."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import json
+
+import casadi as ca
+import numpy as np
+import pytest
+from test_export import STATES, TIMES, untrained
+
+from nocl import parity
+from nocl.export import export
+from nocl.to_c import load
+
+CONTROLLER = untrained()
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("export") / "run"
+    return folder, export(CONTROLLER, folder, ("casadi", "c"), against=())
+
+
+def test_the_certificate_covers_every_part_backend_and_derivative(exported):
+    folder, certificate = exported
+    assert certificate.ok
+    found = {(f.part, f.backend, f.dtype, f.of) for f in certificate.findings}
+    for part in ("policy", "gain", "closed_loop", "value", "value_gradient"):
+        assert (part, "native CasADi", "float64", "first derivatives") in found
+        assert {(part, "C", "float64", "value"), (part, "C", "float32", "value")} <= found
+    for part in ("policy", "value"):
+        assert (part, "C", "float64", "first derivatives") in found
+    written = json.loads((folder / "parity.json").read_text())
+    assert written["ok"] is True
+    assert written["summary"] == str(certificate)
+    assert len(written["findings"]) == len(certificate.findings)
+    assert set(written["findings"][0]["at"]) == {"x", "t"}
+    assert "parity ok: policy, gain" in str(certificate)
+    assert "\n" not in str(certificate)
+
+
+def test_the_files_are_the_controller(exported):
+    folder, _ = exported
+    assert sorted(p.name for p in folder.iterdir()) == [
+        "c", "c_float32", "closed_loop.casadi", "gain.casadi", "parity.json", "policy.casadi", "value.casadi",
+        "value_gradient.casadi"]
+    assert [p.name for p in folder.parent.iterdir()] == ["run"]
+    policy = ca.Function.load(str(folder / "policy.casadi"))
+    np.testing.assert_allclose(policy.map(7)(STATES.T, TIMES[None]).full().T, CONTROLLER(STATES, TIMES), atol=1e-12)
+    for name, tolerance in (("c", 1e-12), ("c_float32", 1e-5)):
+        law = load(folder / name, "cartpole_policy")
+        np.testing.assert_allclose(law(STATES, TIMES), CONTROLLER(STATES, TIMES), atol=tolerance)
+        np.testing.assert_allclose(law(STATES[0], TIMES[0]), CONTROLLER(STATES[0], TIMES[0]), atol=tolerance)
+        costate = load(folder / name, "cartpole_value_gradient")
+        expected = CONTROLLER.value_gradient(STATES, TIMES)
+        np.testing.assert_allclose(costate(STATES, TIMES), expected, rtol=tolerance, atol=tolerance * 100)
+        gain = load(folder / name, "cartpole_gain")(STATES[0], TIMES[0])
+        native = CONTROLLER.gain_to_casadi()(STATES[0], TIMES[0]).full()[0]
+        np.testing.assert_allclose(gain, native, rtol=tolerance, atol=tolerance)
+    text = (folder / "c" / "README.md").read_text()
+    assert all(f"`cartpole_{p}.h`" in text for p in ("policy", "gain", "value", "value_gradient"))
+
+
+class Off:
+    """A controller whose export is off: its torch is not what its CasADi Function is."""
+
+    def __init__(self, shift: float, only: str) -> None:
+        self.shift, self.only, self.ocp = shift, only, CONTROLLER.ocp
+
+    def parts(self) -> list[parity.Part]:
+        return [dataclasses.replace(p, torch=lambda x, t, p=p: p.torch(x, t) + self.shift * x[:, :1] ** 2)
+                if p.name == self.only else p for p in CONTROLLER.parts()]
+
+
+@pytest.mark.parametrize("only", ["policy", "value_gradient"])
+def test_an_export_that_differs_fails_and_leaves_nothing(tmp_path, only):
+    with pytest.raises(ValueError, match=rf"{only}: native CasADi \(float64\) differs from torch .* at .*'x'.*nothing"):
+        export(Off(1e-9, only), tmp_path / "run", ("casadi",), against=())
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_failed_export_leaves_a_former_one_as_it_was(exported, tmp_path):
+    folder = tmp_path / "run"
+    export(CONTROLLER, folder, ("casadi",), against=())
+    before = {p.name: p.read_bytes() for p in folder.iterdir()}
+    with pytest.raises(ValueError, match="nothing was written"):
+        export(Off(1e-3, "policy"), folder, ("casadi", "c"), against=())
+    assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
+
+
+def test_nan_is_no_parity():
+    part = CONTROLLER.parts()[0]
+    z = parity.samples(part)
+    found = parity.findings(part, "broken", "float32", z, lambda z: np.full((len(z), 1), np.nan))
+    assert not found[0].ok
+
+
+def test_samples_hold_the_corners_of_the_box():
+    part = CONTROLLER.parts()[0]
+    z = parity.samples(part, n=10)
+    s = CONTROLLER.ocp.system
+    lower, upper = np.r_[s.lbx, 0], np.r_[s.ubx, 4]
+    corner = ((z == lower) | (z == upper)).all(axis=1)
+    assert corner.sum() == 32
+    assert len(z) == 42
+    assert ((z >= lower) & (z <= upper)).all()
+    np.testing.assert_array_equal(z, z.astype(np.float32))
+
+
+@pytest.mark.parametrize(("thing", "to", "message"), [
+    (CONTROLLER, ("fortran",), "expected some of casadi, l4casadi, onnx, c"),
+    (3, ("casadi",), "got a int; expected a CND or LearnedDynamics"),
+])
+def test_refusals(tmp_path, thing, to, message):
+    with pytest.raises(ValueError, match=message):
+        export(thing, tmp_path / "run", to)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_controller_is_not_changed(tmp_path):
+    controller = copy.deepcopy(CONTROLLER)
+    before = {k: v.clone() for k, v in controller.policy.state_dict().items()}
+    controller.export(tmp_path / "run", against=())
+    assert all(v.equal(before[k]) for k, v in controller.policy.state_dict().items())
+
+
+def test_what_load_refuses(exported, tmp_path):
+    folder, _ = exported
+    with pytest.raises(ValueError, match=r"holds cartpole_closed_loop, .*name one of them"):
+        load(folder / "c")
+    with pytest.raises(ValueError, match="no function of to_c"):
+        load(tmp_path)
+    with pytest.raises(ValueError, match="'no-such-cc' cannot be run"):
+        load(folder / "c", "cartpole_policy", compiler="no-such-cc")
+    law = load(folder / "c", "cartpole_policy")
+    with pytest.raises(ValueError, match=r"shape \(3,\); expected \[4\]"):
+        law(np.zeros(3), 0.0)
+    with pytest.raises(ValueError, match="got 1 arguments; expected 2: x, t"):
+        law(np.zeros(4))
