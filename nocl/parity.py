@@ -36,6 +36,7 @@ class Part:
     bounds: Mapping[str, Any]  # (lower, upper) of each input, which samples are drawn from
     labels: Mapping[str, Sequence[str]] = field(default_factory=dict)
     net: FeatureNet | None = None  # itself a network: other formats take it as it is
+    lean: ca.Function | None = None  # `column` with less workspace, for C
 
     @property
     def column(self) -> ca.Function:
@@ -54,8 +55,8 @@ class Part:
         """C99 in `folder`, as PREFIX_NAME."""
         from nocl.to_c import to_c
 
-        return to_c(self.column, folder, f"{prefix}_{self.name}", bounds=self.bounds, labels=self.labels, dtype=dtype,
-                    note=note)
+        return to_c(self.lean or self.column, folder, f"{prefix}_{self.name}", bounds=self.bounds, labels=self.labels,
+                    dtype=dtype, note=note)
 
 
 @dataclass(frozen=True)

@@ -43,6 +43,12 @@ RESERVED = frozenset((
     "for", "goto", "if", "inline", "int", "long", "main", "register", "restrict", "return", "short", "signed", "sizeof",
     "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "while"))
 
+ONE = ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "exp", "log", "sqrt",
+       "fabs", "floor", "ceil", "log1p", "expm1", "erf")
+TWO = ("pow", "fmin", "fmax", "fmod", "remainder", "atan2", "hypot", "copysign")
+SINGLE = ["#include <math.h>", "/* as <tgmath.h> would, which not every embedded C library has whole */",
+          *(f"#define {f}(x) {f}f(x)" for f in ONE), *(f"#define {f}(x, y) {f}f(x, y)" for f in TWO), ""]
+
 Box = tuple[ArrayLike, ArrayLike]
 
 
@@ -339,7 +345,7 @@ def _source(name: str, inputs: Sequence[_Argument], outputs: Sequence[_Argument]
     size = {key: max(1, n) for key, n in sizes.items()}
     return "\n".join([
         _first_line(f"{name}.c") + f'#include "{name}.h"', "",
-        *(["#include <tgmath.h> /* tanh of a float is tanhf */", ""] if real == "float" else []),
+        *(SINGLE if real == "float" else []),
         "/* What CasADi generates has unused parameters, and functions that describe it: the compiler drops them. */",
         "#if defined(__GNUC__)", "#pragma GCC diagnostic push", '#pragma GCC diagnostic ignored "-Wunused-parameter"',
         '#pragma GCC diagnostic ignored "-Wunused-function"', "#endif", "#define CASADI_SYMBOL_EXPORT static",
@@ -415,8 +421,8 @@ each header says which, with their bounds.
   (`*_vectors.csv`: inputs, and outputs as CasADi computes them in float64; corners of the box first).
 - On a microcontroller: `arm-none-eabi-gcc -mcpu=cortex-m4 -mthumb -mfloat-abi=hard -mfpu=fpv4-sp-d16 -Os
   -ffunction-sections -fstack-usage -c NAME.c`, link with `-Wl,--gc-sections -lm`. A processor with single-precision
-  floating point wants code that was written with dtype="float32". The workspace is on the stack: the `.su` file
-  tells how much.
+  floating point wants code that was written with dtype="float32", and `-fsingle-precision-constant`. The workspace
+  is on the stack: the `.su` file tells how much.
 - From Python: `nocl.to_c.load(folder, "NAME")` compiles it and returns a callable.
 """
 

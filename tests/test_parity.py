@@ -58,8 +58,8 @@ def test_the_files_are_the_controller(exported):
         expected = CONTROLLER.value_gradient(STATES, TIMES)
         np.testing.assert_allclose(costate(STATES, TIMES), expected, rtol=tolerance, atol=tolerance * 100)
         gain = load(folder / name, "cartpole_gain")(STATES[0], TIMES[0])
-        native = CONTROLLER.gain_to_casadi()(STATES[0], TIMES[0]).full()[0]
-        np.testing.assert_allclose(gain, native, rtol=tolerance, atol=tolerance)
+        exact = CONTROLLER.gain_to_casadi()(STATES[0], TIMES[0]).full()[0]
+        np.testing.assert_allclose(gain, exact, rtol=tolerance, atol=tolerance)
     text = (folder / "c" / "README.md").read_text()
     assert all(f"`cartpole_{p}.h`" in text for p in ("policy", "gain", "value", "value_gradient"))
 

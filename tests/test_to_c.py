@@ -6,6 +6,7 @@ import csv
 import ctypes
 import importlib.util
 import re
+import shutil
 import subprocess
 
 import casadi as ca
@@ -159,6 +160,30 @@ def test_l4casadi_functions_have_no_c(tmp_path):
     function = to_casadi(MLP([2, 3, 1]), backend="l4casadi")
     with pytest.raises(ValueError, match="export the network with backend='native'"):
         to_c(function, tmp_path / "c", bounds=XBOX)
+
+
+ARM = ["arm-none-eabi-gcc", "-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-Os", "-std=c99",
+       "-Wall", "-Wextra", "-Werror", "-pedantic", "-ffunction-sections", "-fdata-sections", "-fstack-usage"]
+
+
+@pytest.mark.skipif(shutil.which(ARM[0]) is None, reason=f"{ARM[0]} is not installed")
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_it_compiles_for_a_microcontroller(tmp_path, dtype):
+    """On newlib: linked whole, without the heap, with its workspace on the stack."""
+    folder = to_c(policy(), tmp_path, bounds=BOUNDS, dtype=dtype)
+    real, single = ("double", []) if dtype == "float64" else ("float", ["-fsingle-precision-constant"])
+    (folder / "main.c").write_text(f'#include "policy.h"\nvolatile {real} z[6];\nint main(void) {{\n  {real} x[3] = '
+                                   "{z[0], z[1], z[2]}, u[2];\n  policy(x, z[3], u);\n  z[4] = u[0];\n  return 0;\n}\n")
+    for source in ("policy", "main"):
+        run(*ARM, *single, "-c", f"{source}.c", cwd=folder)
+    stack = {line.split("\t")[0].split(":")[-1]: int(line.split("\t")[1]) for line in
+             (folder / "policy.su").read_text().splitlines()}
+    assert stack["policy"] < 2000
+    run(*ARM[:5], "-Wl,--gc-sections", "--specs=nosys.specs", "main.o", "policy.o", "-lm", "-o", "firmware", cwd=folder)
+    assert "malloc" not in run("arm-none-eabi-nm", "firmware", cwd=folder)
+    undefined = {line.split()[-1] for line in run("arm-none-eabi-nm", "-u", "policy.o", cwd=folder).splitlines()}
+    if dtype == "float32":  # nothing in double precision, which such a processor has to emulate
+        assert not {name for name in undefined if name.startswith("__aeabi_d") or name.endswith("f2d")}
 
 
 @settings(max_examples=6, deadline=None, derandomize=True)

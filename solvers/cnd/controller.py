@@ -103,13 +103,15 @@ class CND:
         x, u = ({"x": [s.unit(n) for n in s.state_names]}, [s.unit(n) for n in s.control_names])
         slopes = [f"d {i} / d {j}" for i in s.control_names for j in s.state_names]
         made = [Part("policy", self.to_casadi(), policy, box | {"u": (s.lbu, s.ubu)}, x | {"u": u}, policy),
-                Part("gain", self.gain_to_casadi(), lambda x, t: _slopes(policy, x, t), box, x | {"K": slopes}),
+                Part("gain", self.gain_to_casadi(), lambda x, t: _slopes(policy, x, t), box, x | {"K": slopes},
+                     lean=_lean(self.to_casadi(), "gain", "K")),
                 Part("closed_loop", self.closed_loop_to_casadi(), lambda x, t: f(x, policy(x, t)), box,
                      x | {"xdot": [f"d {i} / dt" for i in s.state_names]})]
         if value is not None:
             made += [Part("value", self.value_to_casadi(), value, box, x | {"V": ["cost-to-go"]}, value),
                      Part("value_gradient", self.value_gradient_to_casadi(), lambda x, t: _slopes(value, x, t), box,
-                          x | {"V_x": [f"d V / d {i}" for i in s.state_names]})]
+                          x | {"V_x": [f"d V / d {i}" for i in s.state_names]},
+                          lean=_lean(self.value_to_casadi(), "value_gradient", "V_x"))]
         return made
 
     def to_c(self, folder: str | os.PathLike[str], *, dtype: str = "float64",
@@ -179,6 +181,14 @@ def _slopes(net: FeatureNet, x: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
         x = x if x.requires_grad else x.detach().requires_grad_(True)
         y = net(x, t)
         return torch.cat([torch.autograd.grad(y[:, i].sum(), x, create_graph=True)[0] for i in range(y.shape[1])], 1)
+
+
+def _lean(f: ca.Function, name: str, out: str) -> ca.Function:
+    """name:(x, t) -> d f / dx, row by row, by forward derivatives: backwards, CasADi's C copies every weight matrix to
+    the stack (77 kB for cart-pole's gain instead of 3)."""
+    x, t = f.mx_in()
+    columns = [ca.jtimes(f(x, t), x, ca.DM.eye(x.numel())[:, i]) for i in range(x.numel())]
+    return ca.Function(name, [x, t], [ca.vec(ca.densify(ca.horzcat(*columns)).T)], ["x", "t"], [out])
 
 
 def pretrained(name: str, dynamics: str = "exact") -> CND:
