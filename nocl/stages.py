@@ -24,6 +24,7 @@ import casadi as ca
 import numpy as np
 
 from nocl import __version__, store
+from nocl.checks import Array
 from nocl.ocp import OCP
 from nocl.solvers.cnd import CND, TrainSettings, train
 from nocl.sysid import LearnedDynamics, Settings, identify
@@ -32,6 +33,7 @@ QUICK_IDENTIFY = Settings(iterations=300, polish=10)
 QUICK_TRAIN = TrainSettings(seeds=6, starts=6, states=60, tails=300, visits=200, rounds=1, iterations=400,
                             value_tails=400, value_iterations=300, held_out=16)
 PARTS = ("dynamics", "cnd", "export", "report", "checkpoint")  # folders in a run's folder
+REFINED = 4  # intervals of the comparison's reference for one of NMPC's
 KEY = "run"  # of a card: what the stage was made from
 
 
@@ -110,7 +112,7 @@ class Stages:
     def compare(self, cnd: CND, out: Path, methods: Sequence[str], n: int, intervals: int,
                 hold: int | None = None) -> None:
         """Judge the methods on n fresh initial states, save the report and print its summary and verdict."""
-        from nocl.comparisons import compare
+        from nocl.comparisons import compare, reference
 
         x0 = fresh_states(self.ocp, n, self.seed)
         chosen: dict[str, Any] = {name: cnd if name == "CND" else method(self.ocp, name, intervals) for name in methods}
@@ -119,10 +121,20 @@ class Stages:
             say(f"NMPC: solving {n} initial states, {intervals} intervals")
             chosen["NMPC"] = chosen["NMPC"].solve(x0, out=checkpoint)
         say(f"comparing {', '.join(methods)} on the exact dynamics")
+        chosen[reference.NAME] = self._reference(cnd, chosen.get("NMPC"), x0, intervals)
         report = compare(self.ocp, chosen, n=n, seed=fresh_seed(self.seed), hold=hold)
         path = report.save(out)
         _forget(checkpoint)
         say(f"\n{report}\n\nreport: {path}")
+
+    def _reference(self, cnd: CND, nmpc: Any, x0: Array, intervals: int) -> Any:
+        """The optimum on a grid REFINED times finer, from NMPC's controls and from the controller's own."""
+        from nocl.comparisons.reference import Reference
+        from nocl.simulate import simulate
+
+        fine = REFINED * intervals
+        guesses = [simulate(self.ocp, cnd, x0, hold=intervals, nodes=intervals + 1).u[:, :-1]]
+        return Reference(self.ocp, fine, guesses + ([] if nmpc is None else [nmpc.u]))
 
     def _made_from(self, **settings: Any) -> dict[str, Any]:
         problem = hashlib.sha256(json.dumps(self.ocp.to_data(), sort_keys=True).encode()).hexdigest()

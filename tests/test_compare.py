@@ -218,3 +218,21 @@ def test_percentiles_with_failures_are_never_nan(values, q):
 
 def test_the_public_names():
     assert nocl.comparisons.compare is compare
+
+
+def test_the_reference_is_finer_than_what_it_starts_from():
+    """On a fine grid the held optimum lies below that of the coarse grid, and above the continuous one (Riccati)."""
+    from nocl.comparisons.reference import Reference
+    from nocl.solvers import DDP, LQR
+
+    ocp = nocl.load_ocp("double_integrator")
+    x0 = ocp.initial_states.sample(5, 3)
+    coarse = DDP(ocp, intervals=10).solve(x0)
+    guess = coarse.u.copy()
+    guess[0] = np.nan
+    fine = Reference(ocp, 40, [guess]).solve(x0)
+    assert fine.success.all()
+    optimum = LQR(ocp).value(x0, 0.0)
+    assert (fine.cost < coarse.cost).all()
+    assert (fine.cost > optimum).all()
+    assert (fine.cost - optimum < (coarse.cost - optimum) / 10).all()  # the loss of holding falls like h^2
