@@ -188,6 +188,27 @@ class System:
         except (KeyError, TypeError, AttributeError, NotImplementedError, RuntimeError) as error:
             raise ValueError(f"not a System written by nocl: {type(error).__name__}: {error}") from error
 
+    @staticmethod
+    def from_casadi(f: ca.Function, *, lbu: Vector, ubu: Vector, lbx: Vector, ubx: Vector, **options: Any) -> System:
+        """The system of f:(x [nx], u [nu]) -> xdot [nx]; options: name, states, controls (names), angles, units."""
+        from nocl.interop import system_from_casadi
+
+        return system_from_casadi(f, lbu=lbu, ubu=ubu, lbx=lbx, ubx=ubx, **options)
+
+    def to_control(self, x: ArrayLike | None = None, u: ArrayLike | None = None) -> Any:
+        """python-control's NonlinearIOSystem; with (x, u) the StateSpace of the linearisation there."""
+        from nocl import interop
+
+        if (x is None) != (u is None):
+            raise ValueError(f"{self.name}.to_control: got one of x and u; expected both, or neither")
+        return interop.to_control(self) if x is None or u is None else interop.to_statespace(self, x, u)
+
+    def to_do_mpc(self) -> Any:
+        """do-mpc's continuous Model of the system, set up."""
+        from nocl.interop import to_do_mpc
+
+        return to_do_mpc(self)
+
     def __reduce__(self) -> tuple[Any, ...]:
         return System.from_data, (self.to_data(),)  # bare SX does not pickle
 

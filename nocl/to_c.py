@@ -43,8 +43,8 @@ RESERVED = frozenset((
     "for", "goto", "if", "inline", "int", "long", "main", "register", "restrict", "return", "short", "signed", "sizeof",
     "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "while"))
 
-ONE = ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "exp", "log", "sqrt",
-       "fabs", "floor", "ceil", "log1p", "expm1", "erf")
+ONE = ("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh", "exp", "log",
+       "sqrt", "fabs", "floor", "ceil", "log1p", "expm1", "erf")
 TWO = ("pow", "fmin", "fmax", "fmod", "remainder", "atan2", "hypot", "copysign")
 SINGLE = ["#include <math.h>", "/* as <tgmath.h> would, which not every embedded C library has whole */",
           *(f"#define {f}(x) {f}f(x)" for f in ONE), *(f"#define {f}(x, y) {f}f(x, y)" for f in TWO), ""]

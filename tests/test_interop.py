@@ -1,0 +1,130 @@
+"""Other tools get the same system, cost and initial states."""
+
+from __future__ import annotations
+
+import warnings
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import nocl
+from nocl.integrate import rk4_cost
+
+
+@pytest.fixture(scope="module")
+def ocp():
+    return nocl.load_ocp("cartpole")
+
+
+def test_control_has_the_same_dynamics_and_linearisation(ocp):
+    control, s = pytest.importorskip("control"), ocp.system
+    plant = s.to_control()
+    x, u = np.array([0.1, -0.2, 0.3, 0.4]), np.array([0.5])
+    np.testing.assert_allclose(plant.dynamics(0, x, u), s.f(x, u).full().ravel(), rtol=1e-14)
+    assert (plant.state_labels, plant.input_labels) == (list(s.state_names), list(s.control_names))
+    linear = s.to_control(x, u)
+    A, B = s.linearize(x, u)
+    np.testing.assert_array_equal(linear.A, A)
+    np.testing.assert_array_equal(linear.B, B)
+    np.testing.assert_allclose(plant.linearize(x, u).A, A, atol=1e-5)
+    times = np.linspace(0, 1, 11)
+    response = control.input_output_response(plant, times, np.full((1, 11), 0.5), x, solve_ivp_kwargs={"rtol": 1e-9})
+    run = nocl.simulate(ocp, np.full((1, 40, 1), 0.5), x)
+    np.testing.assert_allclose(response.states[:, -1], run.x[0, 10], atol=1e-5)
+    with pytest.raises(ValueError, match="expected both"):
+        s.to_control(x)
+
+
+@pytest.mark.parametrize("problem", ["cartpole", "dubins"])
+@pytest.mark.parametrize("integrator", ["rk4", "cvodes"])
+def test_gymnasium_accepts_the_environment(problem, integrator):
+    pytest.importorskip("gymnasium")
+    from gymnasium.utils.env_checker import check_env
+
+    env = nocl.load_ocp(problem).to_gymnasium(steps=20, integrator=integrator)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warnings.filterwarnings("ignore", message=".*(infinity|symmetric and normalized|spec).*")
+        check_env(env, skip_render_check=True)
+
+
+@pytest.mark.parametrize("integrator", ["rk4", "cvodes"])
+def test_the_return_is_minus_the_cost(ocp, integrator):
+    pytest.importorskip("gymnasium")
+    env = ocp.to_gymnasium(steps=40, integrator=integrator)
+    x0, u = ocp.initial_states.sample(1, 3)[0], np.random.default_rng(0).uniform(-4, 4, (40, 1))
+    observation, info = env.reset(options={"x0": x0})
+    np.testing.assert_array_equal(observation, [*x0, 0])
+    total, over = 0.0, False
+    for held in u:
+        assert not over
+        observation, reward, over, truncated, info = env.step(held)
+        total += reward
+        assert not truncated
+    assert over
+    assert info["cost"] == pytest.approx(-total)
+    clipped = np.clip(u, -3, 3)
+    if integrator == "cvodes":
+        run = nocl.simulate(ocp, clipped[None], x0)
+        x, cost = run.x[0, -1], run.cost[0]
+    else:
+        x, cost = x0, 0.0
+        for held in clipped:
+            x, part = rk4_cost(ocp.system.f, ocp.L, x, held, 0.1)
+            cost += float(part)
+        x, cost = x.full().ravel(), cost + float(ocp.G(x))
+    np.testing.assert_allclose(observation, [*x, 4], rtol=1e-5, atol=1e-5)  # it tumbles
+    assert -total == pytest.approx(cost, rel=1e-5)
+    with pytest.raises(ValueError, match="expected reset"):
+        env.step(u[0])
+
+
+def test_initial_states_are_the_problems(ocp):
+    pytest.importorskip("gymnasium")
+    env = ocp.to_gymnasium(observe_time=False)
+    first, _ = env.reset(seed=7)
+    again, _ = env.reset(seed=7)
+    np.testing.assert_array_equal(first, again)
+    assert first.shape == (4,)
+    states = np.array([env.reset()[0] for _ in range(300)])
+    np.testing.assert_allclose(states.mean(axis=0), ocp.initial_states.mean, atol=0.03)
+    np.testing.assert_allclose(states.std(axis=0), ocp.initial_states.std, atol=0.02)
+
+
+def test_a_system_from_a_function(ocp):
+    s = ocp.system
+    box = {"lbu": s.lbu, "ubu": s.ubu, "lbx": s.lbx, "ubx": s.ubx}
+    x, u = ca.MX.sym("x", 4), ca.MX.sym("u", 1)
+    for f in (s.f, ca.Function("wrapped", [x, u], [s.f(x, u)])):
+        made = nocl.System.from_casadi(f, name="mine", states=s.state_names, controls=["force"], angles=["theta"],
+                                       **box)
+        assert (made.name, made.control_names, made.angles) == ("mine", ("force",), ("theta",))
+        z = np.array([0.1, 0.2, 0.3, 0.4])
+        np.testing.assert_allclose(made.f(z, 0.5).full(), s.f(z, 0.5).full(), rtol=1e-14)
+    assert nocl.System.from_casadi(s.f, **box).names == ("x0", "x1", "x2", "x3", "u0")
+    with pytest.raises(ValueError, match="states has 2 names; f has 4"):
+        nocl.System.from_casadi(s.f, states=["a", "b"], **box)
+    with pytest.raises(ValueError, match=r"expected a casadi\.Function \(x \[nx\], u \[nu\]\) -> xdot"):
+        nocl.System.from_casadi(ca.Function("f", [x], [x]), **box)
+
+
+def test_do_mpc_gets_the_equations(ocp):
+    pytest.importorskip("do_mpc")
+    model = ocp.system.to_do_mpc()
+    assert model.n_x == 4
+
+
+@pytest.mark.parametrize("options", [{"steps": 0}, {"integrator": "euler"}])
+def test_refusals(ocp, options):
+    with pytest.raises(ValueError, match=next(iter(options))):
+        ocp.to_gymnasium(**options)
+
+
+def test_missing_packages_say_how_to_install_them(ocp, monkeypatch):
+    modules = __import__("sys").modules
+    for name in ("control", "gymnasium", "do_mpc"):
+        monkeypatch.setitem(modules, name, None)
+    for call in (ocp.system.to_control, ocp.to_gymnasium, ocp.system.to_do_mpc):
+        with pytest.raises(ValueError, match="pip install"):
+            call()
