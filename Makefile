@@ -20,10 +20,10 @@ demo: set-up
 	$(BIN)/nocl run cartpole --out runs/cartpole
 
 test: lint
-	$(BIN)/python -m pytest -m "not slow"
+	$(BIN)/python -m pytest -n auto -m "not slow"
 
 test-slow: lint
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto
 
 pretrained: set-up
 	$(BIN)/python benchmarks/controllers.py --seeds 0 --keep nocl/pretrained --results pretrained

@@ -210,7 +210,7 @@ def test_a_run_from_a_users_file_to_its_report(here, capsys, monkeypatch):
     x = np.array([1.0, 0.1])
     np.testing.assert_allclose(policy(x, 0.5).full().ravel(), cnd(x, 0.5), rtol=1e-12)
     rows = json.loads((run / "report" / "summary.json").read_text())["summary"]
-    assert [row["method"] for row in rows] == ["CND", "NMPC"]
+    assert [row["method"] for row in rows] == ["CND", "NMPC", "reference"]
 
     before = {p: p.stat().st_mtime_ns for part in ("dynamics", "cnd") for p in (run / part).iterdir()}
     assert main([*RUN[:-3], "3", "--intervals", "10", "--methods", "cnd,lqr"]) == 0  # the same, on other states
