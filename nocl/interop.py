@@ -87,7 +87,7 @@ def to_gymnasium(ocp: OCP, *, steps: int = 80, integrator: str = "rk4", observe_
     """A gymnasium.Env of the problem: `steps` equal intervals over the horizon, controls held and clipped to U.
 
     Observations are x, then t (unless observe_time is False), float64; actions are u in U; the reward of a step is
-    minus the integral of L over it, in the last step also minus G(x(T)), so that the return is minus the cost. Episodes are
+    minus the integral of L over it, in the last step also minus G(x(T)): the return is minus the cost. Episodes are
     terminated at the horizon, with a reward of the step's cost at the last finite state where the state blows up.
     reset(options={"x0": x}) starts at a given state. info has "cost", the cost so far, and "clearance", the least path
     constraint at the state. integrator: "rk4", the discretisation of NMPC, or "cvodes", the judge's. Path constraints
