@@ -138,7 +138,7 @@ class CND:
 
     def save(self, folder: str | os.PathLike[str]) -> Path:
         """Write controller, value, problem and card as one data-only file in `folder`."""
-        nets = {"policy": _lean(self.policy)} | ({} if self.value_net is None else {"value": _lean(self.value_net)})
+        nets = {"policy": _single(self.policy)} | ({} if self.value_net is None else {"value": _single(self.value_net)})
         return store.save(Path(folder), KIND, nets=nets, card={"ocp": self.ocp.to_data(), "card": self.card})
 
     @classmethod
@@ -192,8 +192,8 @@ def _lean(f: ca.Function, name: str, out: str) -> ca.Function:
     return ca.Function(name, [x, t], [ca.vec(ca.densify(ca.horzcat(*columns)).T)], ["x", "t"], [out])
 
 
-def _lean(net: FeatureNet) -> FeatureNet:
-    """The same numbers in half the bytes, where single precision holds every weight exactly (training's own is that)."""
+def _single(net: FeatureNet) -> FeatureNet:
+    """The same numbers in half the bytes, where single precision holds every weight exactly (as after training)."""
     exact = all(bool((p == p.float().double()).all()) for p in net.parameters())
     return copy.deepcopy(net).float() if exact else net
 
