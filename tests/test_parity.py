@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import importlib.util
 import json
+import subprocess
+import sys
 
 import casadi as ca
 import numpy as np
@@ -140,3 +143,19 @@ def test_what_load_refuses(exported, tmp_path):
         law(np.zeros(3), 0.0)
     with pytest.raises(ValueError, match="got 1 arguments; expected 2: x, t"):
         law(np.zeros(4))
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(importlib.util.find_spec("l4casadi") is None, reason="l4casadi is not installed")
+def test_l4casadi_files_work_in_another_process_and_a_failure_leaves_none(tmp_path, monkeypatch):
+    folder = tmp_path / "run"
+    export(CONTROLLER, folder, ("l4casadi",), against=())
+    command = (f"import casadi, l4casadi; f = casadi.Function.load({str(folder / 'l4casadi' / 'policy.casadi')!r}); "
+               f"print(float(f({STATES[0].tolist()}, {TIMES[0]})))")
+    out = subprocess.run([sys.executable, "-c", command], capture_output=True, text=True, check=True, cwd=tmp_path)
+    assert float(out.stdout) == pytest.approx(CONTROLLER(STATES[0], TIMES[0])[0], abs=1e-5)
+    before = sorted(folder.rglob("*"))
+    monkeypatch.setitem(parity.LIMITS, "float32", 1e-12)  # passed once the library is built
+    with pytest.raises(ValueError, match=r"L4CasADi \(float32\).*nothing was written"):
+        export(CONTROLLER, folder, ("l4casadi",), against=())
+    assert sorted(folder.rglob("*")) == before
