@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 import shutil
 import tempfile
@@ -34,7 +35,8 @@ def parts_of(thing: Any) -> list[Part]:
         box = {"x": (s.lbx, s.ubx), "u": (s.lbu, s.ubu)}
         labels = {"x": [s.unit(n) for n in s.state_names], "u": [s.unit(n) for n in s.control_names],
                   "xdot": [f"d {n} / dt" for n in s.state_names]}
-        return [Part("dynamics", thing.to_casadi(), thing.net.double(), box, labels, thing.net)]
+        net = copy.deepcopy(thing.net).double().eval()
+        return [Part("dynamics", thing.to_casadi(), net, box, labels, net)]
     raise ValueError(f"export: got a {type(thing).__name__}; expected a CND or LearnedDynamics")
 
 

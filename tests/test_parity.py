@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from test_export import STATES, TIMES, untrained
 
+import nocl
 from nocl import parity
 from nocl.export import export
 from nocl.to_c import load
@@ -143,6 +144,16 @@ def test_what_load_refuses(exported, tmp_path):
         law(np.zeros(3), 0.0)
     with pytest.raises(ValueError, match="got 1 arguments; expected 2: x, t"):
         law(np.zeros(4))
+
+
+def test_learned_dynamics_leave_too(tmp_path):
+    ocp = nocl.load_ocp("double_integrator")
+    model = nocl.identify(ocp.system, seed=0, progress=False)
+    certificate = export(model, tmp_path / "run", ("casadi", "c"), against=())
+    assert {f.part for f in certificate.findings} == {"dynamics"}
+    f, z = load(tmp_path / "run" / "c"), np.array([[0.3, -0.4]])
+    np.testing.assert_allclose(f(z, [[0.5]]), model.to_casadi()(z[0], 0.5).full().T, rtol=1e-12, atol=1e-14)
+    assert ca.Function.load(str(tmp_path / "run" / "dynamics.casadi")).name_in() == ["x", "u"]
 
 
 @pytest.mark.slow
