@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 METHODS = ("CND", "NMPC", "LQR", "DDP")
 SOLVERS = ("nmpc", "ddp", "lqr")
 FORMS = ("casadi", "l4casadi", "c")
+MOST = 1_000_000  # of anything counted on the command line
+SEEDS = 2**62  # so that seeds made from one still fit in 64 bits
 INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 
 
@@ -85,19 +87,19 @@ def parser() -> argparse.ArgumentParser:
     sub = command("export", _export, "write a run's controller, value function and dynamics as CasADi files or C")
     _add(sub, "run")
     sub.add_argument("--to", choices=FORMS, action="append", help="default: casadi and c; may be given several times")
-    sub.add_argument("--out", metavar="DIR", help="default: RUN/export")
+    sub.add_argument("--out", type=_folder, metavar="DIR", help="default: RUN/export")
     sub = command("compare", _compare, "compare a run's controller with other methods, initial state by initial state")
     _add(sub, "run", "seed", "n", "intervals", "methods")
     sub.add_argument("--hold", type=_count, metavar="K", help="judge feedback once more, held on K intervals")
-    sub.add_argument("--out", metavar="DIR", help="default: RUN/report")
+    sub.add_argument("--out", type=_folder, metavar="DIR", help="default: RUN/report")
     return top
 
 
 def _add(sub: argparse.ArgumentParser, *names: str) -> None:
     arguments: dict[str, tuple[str, dict[str, Any]]] = {
         "problem": ("problem", {"metavar": "NAME_OR_FILE", "help": "a problem's name, or a .py file with `ocp`"}),
-        "run": ("run", {"metavar": "RUN", "help": "the folder of a run, like runs/cartpole"}),
-        "out": ("--out", {"metavar": "DIR", "help": "default: runs/NAME"}),
+        "run": ("run", {"type": _folder, "metavar": "RUN", "help": "the folder of a run, like runs/cartpole"}),
+        "out": ("--out", {"type": _folder, "metavar": "DIR", "help": "default: runs/NAME"}),
         "seed": ("--seed", {"type": _seed, "default": 0, "help": "of all that is drawn; default: 0"}),
         "n": ("--n", {"type": _count, "default": 100, "help": "number of initial states; default: 100"}),
         "exact": ("--exact", {"action": "store_true", "help": "train on the exact dynamics, not on learned ones"}),
@@ -118,15 +120,26 @@ def _version() -> str:
 
 
 def _count(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 1")
-    return int(text)
+    return _whole(text, 1, MOST)
 
 
 def _seed(text: str) -> int:
-    if not text.isdecimal():
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least 0")
+    return _whole(text, 0, SEEDS - 1)
+
+
+def _whole(text: str, least: int, most: int) -> int:
+    """A number of least to most in the digits 0 to 9; int() alone also takes signs, underscores and other scripts."""
+    digits = text.isascii() and text.isdecimal() and len(text) <= len(str(most))
+    if not digits or not least <= int(text) <= most:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least {least} and at most {most}")
     return int(text)
+
+
+def _folder(text: str) -> Path:
+    """A folder's name; a blank one, as of an unset variable, would be the current folder."""
+    if not text.strip() or "\0" in text:
+        raise argparse.ArgumentTypeError(f"{text!r} is no folder's name")
+    return Path(text)
 
 
 def _methods(text: str) -> tuple[str, ...]:
@@ -161,15 +174,13 @@ def _problem(args: argparse.Namespace) -> tuple[OCP, Path]:
 
     ocp = load_ocp(args.problem)
     name = Path(args.problem).stem if args.problem.endswith(".py") else args.problem
-    out = Path(args.out) if args.out is not None else Path("runs") / name
+    out = args.out if args.out is not None else Path("runs") / name
     _check_out(out)
     return ocp, out
 
 
 def _check_out(out: Path) -> None:
     """Whether files can be written under `out`, without writing any."""
-    if not str(out).strip() or "\0" in str(out):
-        raise ValueError(f"--out is {str(out)!r}; expected a folder")
     for path in (out, *out.absolute().parents):
         if path.exists():
             if not path.is_dir():
@@ -219,9 +230,9 @@ def _solve(args: argparse.Namespace) -> None:
 def _export(args: argparse.Namespace) -> None:
     from nocl.stages import Stages, load_run
 
-    run = Path(args.run)
+    run = args.run
     cnd = load_run(run)
-    out = Path(args.out) if args.out is not None else run / "export"
+    out = args.out if args.out is not None else run / "export"
     _check_out(out)
     Stages(cnd.ocp, run, 0, False).export(cnd, out, tuple(dict.fromkeys(args.to or ("casadi", "c"))))
 
@@ -229,9 +240,9 @@ def _export(args: argparse.Namespace) -> None:
 def _compare(args: argparse.Namespace) -> None:
     from nocl.stages import Stages, load_run
 
-    run = Path(args.run)
+    run = args.run
     cnd = load_run(run)
-    out = Path(args.out) if args.out is not None else run / "report"
+    out = args.out if args.out is not None else run / "report"
     _check_out(out)
     _other_methods(cnd.ocp, args.methods, args.intervals)
     Stages(cnd.ocp, run, args.seed, False).compare(cnd, out, args.methods, args.n, args.intervals, args.hold)

@@ -93,6 +93,18 @@ BAD = [
     ("compare missing", "no folder missing"),
     ("compare notes.txt", "no folder notes.txt"),
     ("compare half --hold 0", "at least 1"),
+    ("run cubic.py --out=", "no folder's name"),
+    ("identify cubic.py --out=", "no folder's name"),
+    ("solve cubic.py --out=\0", "no folder's name"),
+    ("export other --out=", "no folder's name"),
+    ("compare other --out=", "no folder's name"),
+    ("run cubic.py --seed 99999999999999999999999", "at most 4611686018427387903"),
+    (f"identify cubic.py --seed {2**62}", "at most 4611686018427387903"),
+    ("run cubic.py --n 99999999999999999999", "at most 1000000"),
+    ("run cubic.py --n 1000001", "at most 1000000"),
+    ("run cubic.py --n \uff12", "at least 1"),
+    ("run cubic.py --n " + 5000 * "1", "at most 1000000"),
+    ("compare half --seed \u0663", "at least 0"),
 ]
 
 
@@ -106,6 +118,16 @@ def test_bad_input_is_one_line_and_nothing_is_written(here, capsys, line, said):
     assert captured.err.count("\n") == 1
     assert said in captured.err
     assert "Traceback" not in captured.err
+    assert tree(here) == before
+
+
+@pytest.mark.parametrize("words", [["identify", "cubic.py", "--out", "  "], ["run", "cubic.py", "--out", ""],
+                                   ["export", ""], ["compare", "\t"], ["export", "half", "--out", " "],
+                                   ["compare", "half", "--out", " "]])
+def test_a_blank_folder_is_not_the_current_one(here, capsys, words):
+    before = tree(here)
+    assert main(words) == 2
+    assert "is no folder's name" in capsys.readouterr().err
     assert tree(here) == before
 
 
