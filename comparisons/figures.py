@@ -55,6 +55,11 @@ def look(m: int) -> dict[str, Any]:
     return {"color": COLOURS[m % len(COLOURS)], "linestyle": DASHES[m % len(DASHES)]}
 
 
+def plain(text: str) -> str:
+    """Text as matplotlib draws it unchanged: a pair of $ would start a formula."""
+    return text.replace("$", r"\$")
+
+
 def worst_states(report: Report) -> list[int]:
     """States by the gap of the first method, the widest first."""
     return np.argsort(-report.gap[0], kind="stable").tolist()
@@ -76,7 +81,7 @@ def gaps(report: Report) -> Figure:
         known = np.sort(report.gap[m][report.feasible[m] & np.isfinite(report.gap[m])])
         share = 100 * np.arange(1, len(known) + 1) / n
         share = np.r_[0, share, 100 * len(known) / n]
-        ax.step(np.r_[0, known, right], share, where="post", label=judged.name, **look(m))
+        ax.step(np.r_[0, known, right], share, where="post", label=plain(judged.name), **look(m))
     ax.set_xscale("symlog", linthresh=SMALL_GAP)
     for x, text in ((1, "1 %"), (5, "5 %")):
         ax.axvline(x, color="0.6", linewidth=0.8)
@@ -96,14 +101,14 @@ def costs(report: Report) -> Figure:
     for m, judged in enumerate(report.judged[:-1]):
         ok = np.isfinite(report.cost[m]) & np.isfinite(reference)
         ax.plot(reference[ok], report.cost[m][ok], linestyle="", marker="ox^s"[m % 4], markersize=4, alpha=0.7,
-                color=COLOURS[m % len(COLOURS)], label=judged.name)
+                color=COLOURS[m % len(COLOURS)], label=plain(judged.name))
     if both.any():
         low, high = report.cost[:, both].min(), report.cost[:, both].max()
         ax.plot([low, high], [low, high], color="0.5", linewidth=0.8, label="equal")
         if low > 0 and high > 20 * low:
             ax.set(xscale="log", yscale="log")
-    others = report.judged[0].name if len(report.judged) == 2 else "the others"
-    ax.set(xlabel=f"cost of {report.judged[-1].name}", ylabel=f"cost of {others}")
+    others = plain(report.judged[0].name) if len(report.judged) == 2 else "the others"
+    ax.set(xlabel=f"cost of {plain(report.judged[-1].name)}", ylabel=f"cost of {others}")
     ax.legend()
     return figure
 
@@ -111,7 +116,7 @@ def costs(report: Report) -> Figure:
 def trajectories(report: Report, states: Sequence[int]) -> Figure:
     """States and controls over time; a column for each initial state, a line for each method."""
     s = report.ocp.system
-    names = [s.unit(name) for name in s.names]
+    names = [plain(s.unit(name)) for name in s.names]
     width, height = 3.1 * len(states) + 0.9, 1.15 * len(names) + 0.9
     figure = Figure(figsize=(width, height))  # laid out in inches: the layout engines take seconds on so many axes
     edges = {"left": 0.75 / width, "right": 1 - 0.1 / width, "bottom": 0.45 / height, "top": 1 - 0.55 / height}
@@ -135,7 +140,7 @@ def trajectories(report: Report, states: Sequence[int]) -> Figure:
 
 def _gap_title(report: Report, i: int) -> str:
     gap = report.gap[0, i]
-    name = report.judged[0].name
+    name = plain(report.judged[0].name)
     return f"{name} +{percent(max(gap, 0.0))} %" if np.isfinite(gap) else f"{name} failed"
 
 
@@ -144,4 +149,4 @@ def _draw_run(axes: Any, t: Array, x: Array, u: Array, m: int, name: str, steps:
     for k, ax in enumerate(axes):
         y = x[:, k] if k < nx else u[:, k - nx]
         style = {"drawstyle": "steps-post"} if steps and k >= nx else {}
-        ax.plot(t, y, linewidth=1.3, label=name, **style, **look(m))
+        ax.plot(t, y, linewidth=1.3, label=plain(name), **style, **look(m))

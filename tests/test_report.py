@@ -5,10 +5,12 @@ import json
 import re
 import xml.etree.ElementTree as ET
 
+import casadi as ca
 import numpy as np
 import pytest
 
-from nocl.comparisons import compare
+import nocl
+from nocl.comparisons import compare, figures
 from nocl.comparisons.files import write_report
 from nocl.solvers import LQR
 from nocl.systems import double_integrator
@@ -62,6 +64,21 @@ def test_the_page_says_what_was_found(report, folder):
     assert "<b>far" not in page
     for word in ("casadi", "numpy", "double_integrator", "horizon 2", "drawn with seed 0", "prefers-color-scheme"):
         assert word in page
+
+
+def test_names_are_drawn_as_they_are(tmp_path):
+    """A pair of $ starts a formula in matplotlib, and one that is none breaks the drawing."""
+    p, v, u = (ca.SX.sym(name) for name in ("p$_{$", "v$^$", "u"))
+    odd = nocl.System("odd", x=ca.vertcat(p, v), u=u, xdot=ca.vertcat(v, u), lbu=[-3], ubu=[3], lbx=[-2, -2],
+                      ubx=[2, 2], units={"u": r"\$^2$"})
+    ocp = nocl.OCP.quadratic(odd, horizon=1.0, x_goal=[0, 0], u_goal=[0],
+                             initial_states=nocl.Gaussian(mean=[1, 0], std=[0.1, 0.1]))
+    report = compare(ocp, {"$_{$": LQR(ocp), "$^$": nothing}, n=1, progress=False)
+    report.save(tmp_path)
+    figure = figures.draw(report)["trajectories"]
+    figure.draw_without_rendering()
+    assert figure.axes[0].get_ylabel() == r"p\$_{\$"
+    assert [text.get_text() for text in figure.legends[0].texts] == [r"\$_{\$", r"\$^\$"]
 
 
 def test_rows_come_back_from_csv_bit_by_bit(report, folder):
