@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from nocl import checks
 from nocl.checks import Array
-from nocl.comparisons.report import Judged, Report
+from nocl.comparisons.report import Judged, Report, count
 from nocl.data import Solution
 from nocl.ocp import OCP
 from nocl.simulate import Simulation, policy_function, simulate
@@ -103,7 +103,7 @@ def _plans(ocp: OCP, name: str, method: Any, x0: Array, hold: int | None) -> Ite
     if policy is not None:
         yield _Plan(name, _feedback(ocp, method, policy, None, name))
         if hold is not None:
-            held = f"{name} ({hold} holds)"
+            held = f"{name} ({count(hold, 'hold')})"
             yield _Plan(held, _feedback(ocp, method, policy, hold, held))
     elif hasattr(method, "solve"):
         yield _Plan(name, lambda x0, progress: _open_loop(ocp, _solve(method, x0, progress), x0, progress, name))
@@ -154,7 +154,7 @@ def _off_grid(ocp: OCP, solution: Any) -> str:
 def _feedback(ocp: OCP, method: Any, policy: ca.Function | None, hold: int | None,
               name: str) -> Callable[[Array, bool | None], Judged]:
     controller = method if policy is None else policy
-    how = "continuous feedback" if hold is None else f"feedback, held on {hold} intervals"
+    how = "continuous feedback" if hold is None else f"feedback, held on {count(hold, 'interval')}"
 
     def run(x0: Array, progress: bool | None) -> Judged:
         simulation = _in_chunks(lambda x: simulate(ocp, controller, x, hold=hold), ocp, x0, progress, name)
@@ -228,7 +228,7 @@ def _open_loop(ocp: OCP, parts: Sequence[tuple[Any, float] | str], x0: Array, pr
     if solved.any():
         run = _in_chunks(lambda i: simulate(ocp, u[i], x0[i]), ocp, np.flatnonzero(solved), progress, name)
         simulation = _put(simulation, run, solved)
-    how = f"open loop, held on {K} intervals"
+    how = f"open loop, held on {count(K, 'interval')}"
     return Judged(name, how, simulation, ms, np.full(len(x0), np.nan), solves, predicted)
 
 

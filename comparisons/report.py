@@ -146,7 +146,7 @@ class Report:
         return write_report(self, Path(folder))
 
     def __str__(self) -> str:
-        what = f"{self.ocp.system.name}, {_count(len(self.x0), 'initial state')} {self.settings['initial states']}"
+        what = f"{self.ocp.system.name}, {count(len(self.x0), 'initial state')} {self.settings['initial states']}"
         said = [textwrap.fill(sentence, WIDTH, subsequent_indent="  ") for sentence in self.verdict()]
         return "\n".join([what, "", str(self.summary()), "", *NOTE, "", *said])
 
@@ -229,7 +229,7 @@ def verdict(report: Report) -> list[str]:
     summary = report.summary()
     n = len(report.x0)
     near = [f"{row['method']} on {_share(row['within_5'], n)}{_gap_text(row)}" for row in summary]
-    sentence = f"Within 5 % of the best known cost of {_count(n, 'initial state')}: " + ", ".join(near) + "."
+    sentence = f"Within 5 % of the best known cost of {count(n, 'initial state')}: " + ", ".join(near) + "."
     return [sentence, *_manners(summary), *_speed(summary), *_failures(summary, n)]
 
 
@@ -250,7 +250,8 @@ def _share(percent_of_n: float, n: int) -> str:
     return f"all {n}" if k == n > 1 else f"{k} of {n}"
 
 
-def _count(k: int, what: str) -> str:
+def count(k: int, what: str) -> str:
+    """Like '1 interval' or '2 intervals'."""
     return f"{k} {what}" + ("" if k == 1 else "s")
 
 

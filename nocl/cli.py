@@ -89,7 +89,8 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--to", choices=FORMS, action="append", help="default: casadi and c; may be given several times")
     sub.add_argument("--out", type=_folder, metavar="DIR", help="default: RUN/export")
     sub = command("compare", _compare, "compare a run's controller with other methods, initial state by initial state")
-    _add(sub, "run", "seed", "n", "intervals", "methods")
+    _add(sub, "run", "n", "intervals", "methods")
+    sub.add_argument("--seed", type=_seed, help="of the initial states; default: the seed of the run")
     sub.add_argument("--hold", type=_count, metavar="K", help="judge feedback once more, held on K intervals")
     sub.add_argument("--out", type=_folder, metavar="DIR", help="default: RUN/report")
     return top
@@ -245,7 +246,8 @@ def _compare(args: argparse.Namespace) -> None:
     out = args.out if args.out is not None else run / "report"
     _check_out(out)
     _other_methods(cnd.ocp, args.methods, args.intervals)
-    Stages(cnd.ocp, run, args.seed, False).compare(cnd, out, args.methods, args.n, args.intervals, args.hold)
+    seed = int(cnd.card.get("seed", 0)) if args.seed is None else args.seed
+    Stages(cnd.ocp, run, seed, False).compare(cnd, out, args.methods, args.n, args.intervals, args.hold)
 
 
 def _other_methods(ocp: OCP, methods: Sequence[str], intervals: int) -> None:

@@ -92,22 +92,26 @@ class Stages:
     def export(self, cnd: CND, out: Path, forms: Sequence[str]) -> None:
         """The controller, the value function and the learned dynamics, where there are any, in each of the forms."""
         start = time.perf_counter()
+        learned = "casadi" in forms and cnd.card.get("dynamics") == "learned"
+        model = self._dynamics_there() if learned else None  # all is read before the first file is written
         for form in forms:
             if form == "c":
                 cnd.to_c(out / "c")
             else:
-                self._export_casadi(cnd, out, form)
+                self._export_casadi(cnd, model if form == "casadi" else None, out, form)
         say(f"export: {', '.join(forms)} in {out}, {time.perf_counter() - start:.1f} s")
 
-    def _export_casadi(self, cnd: CND, out: Path, form: str) -> None:
+    def _export_casadi(self, cnd: CND, model: LearnedDynamics | None, out: Path, form: str) -> None:
         """L4CasADi's functions call their libraries, which therefore stay beside them."""
         native, folder = form == "casadi", out if form == "casadi" else out / form
         backend, build = ("native", None) if native else (form, folder / "lib")
-        save_function(cnd.to_casadi(backend, build), folder / "policy.casadi")
+        functions = {"policy": cnd.to_casadi(backend, build)}
         if cnd.value_net is not None:
-            save_function(cnd.value_to_casadi(backend, build), folder / "value.casadi")
-        if native and cnd.card.get("dynamics") == "learned" and (model := self._dynamics_there()) is not None:
-            save_function(model.to_casadi(), folder / "dynamics.casadi")
+            functions["value"] = cnd.value_to_casadi(backend, build)
+        if model is not None:
+            functions["dynamics"] = model.to_casadi()
+        for name, function in functions.items():
+            save_function(function, folder / f"{name}.casadi")
 
     def compare(self, cnd: CND, out: Path, methods: Sequence[str], n: int, intervals: int,
                 hold: int | None = None) -> None:
@@ -232,7 +236,8 @@ def solve(ocp: OCP, out: Path, name: str, n: int, seed: int, intervals: int) -> 
     store.write_json(out / f"{name}.json", {"solver": name, "n": n, "seed": fresh_seed(seed), "message": list(message)})
     ok = arrays["success"]
     mean = f", mean cost {arrays['cost'][ok].mean():.4g}" if ok.any() else ""
-    say(f"{name}: {ok.sum()} of {n} solved{mean}, {time.perf_counter() - start:.1f} s\n{path}")
+    did = "simulated" if name == "lqr" else "solved"
+    say(f"{name}: {ok.sum()} of {n} {did}{mean}, {time.perf_counter() - start:.1f} s\n{path}")
 
 
 def _write_arrays(path: Path, arrays: dict[str, Any]) -> Path:

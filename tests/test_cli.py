@@ -197,7 +197,7 @@ def test_version(capsys):
 @pytest.mark.parametrize("solver", ["nmpc", "ddp", "lqr"])
 def test_solve_writes_solutions(here, capsys, solver):
     assert main(["solve", "cubic.py", "--solver", solver, "--n", "2", "--intervals", "10", "--out", "new"]) == 0
-    assert "2 of 2 solved" in capsys.readouterr().out
+    assert f"2 of 2 {'simulated' if solver == 'lqr' else 'solved'}" in capsys.readouterr().out
     with np.load(here / "new" / "solutions" / f"{solver}.npz", allow_pickle=False) as data:
         np.testing.assert_array_equal(data["x0"], nocl.load_ocp("cubic.py").initial_states.sample(2, 1))
         assert data["success"].all()
@@ -241,13 +241,26 @@ def test_a_run_from_a_users_file_to_its_report(here, capsys, monkeypatch):
     assert "controller: taken from out/cnd" in out
     assert {p: p.stat().st_mtime_ns for p in before} == before
 
+    damaged = run / "dynamics" / "dynamics.safetensors"
+    whole = damaged.read_bytes()
+    damaged.write_bytes(whole[:50])
+    before = {p: p.stat().st_mtime_ns for p in (run / "export").rglob("*")}
+    assert main(["export", "out"]) == 2  # and nothing of what stands there is written anew
+    assert {p: p.stat().st_mtime_ns for p in (run / "export").rglob("*")} == before
+    damaged.write_bytes(whole)
+    capsys.readouterr()
+
     assert main([*RUN, "--seed", "1", "--exact"]) == 0
     out = capsys.readouterr().out
     assert "controller: training on the exact dynamics (what is there was made for another" in out
     assert CND.load(run / "cnd").card["seed"] == 1
 
     assert main(["compare", "out", "--n", "2", "--methods", "CND,DDP", "--hold", "20", "--out", "elsewhere"]) == 0
-    assert "CND (20 holds)" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "CND (20 holds)" in out
+    assert "drawn with seed 2" in out  # one more than that of the run
+    assert main(["compare", "out", "--n", "2", "--methods", "CND", "--seed", "7"]) == 0
+    assert "drawn with seed 8" in capsys.readouterr().out
     assert (here / "elsewhere" / "report.html").is_file()
     assert main(["export", "out", "--to", "c", "--out", "source"]) == 0
     assert {p.name for p in (here / "source").iterdir()} == {"c"}

@@ -81,6 +81,12 @@ def test_summary(report):
     assert "NMPC: open loop, held on 20 intervals" in report.verdict()[1]
 
 
+def test_one_is_not_many(ocp):
+    report = compare(ocp, {"LQR": LQR(ocp)}, n=1, hold=1, progress=False)
+    assert [(row["method"], row["how"]) for row in report.summary()] == \
+        [("LQR", "continuous feedback"), ("LQR (1 hold)", "feedback, held on 1 interval")]
+
+
 def test_the_report_is_frozen(report):
     with pytest.raises(dataclasses.FrozenInstanceError):
         report.x0 = None
