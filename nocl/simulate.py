@@ -169,7 +169,7 @@ class _Judge:
 
     def __init__(self, ocp: OCP, f: ca.Function, rtol: float, atol: float) -> None:
         self.ocp, self.f = ocp, f
-        self.options = {"reltol": rtol, "abstol": atol, "disable_internal_warnings": True,
+        self.options = {"reltol": rtol, "abstol": atol, "quad_err_con": True, "disable_internal_warnings": True,
                         "show_eval_warnings": False, "max_num_steps": 20000}
 
     def integrator(self, dae: dict[str, Any], grid: Array, method: str) -> ca.Function:

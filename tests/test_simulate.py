@@ -223,3 +223,15 @@ def test_bad_input(kwargs, words):
 def test_the_judge_needs_no_torch():
     code = "import sys, nocl.simulate; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_control_magnitude_does_not_depend_on_the_nodes():
+    """It is integrated under the same error control as the states."""
+    from nocl.solvers import LQR
+
+    ocp = nocl.load_ocp("double_integrator")
+    x0, controller = ocp.initial_states.sample(4, 2), LQR(ocp)
+    fine = simulate(ocp, controller, x0, nodes=4001)
+    trapezoid = np.trapezoid(np.linalg.norm(fine.u, axis=2), fine.t, axis=1) / ocp.horizon
+    for nodes in (5, 81):
+        np.testing.assert_allclose(simulate(ocp, controller, x0, nodes=nodes).control_magnitude, trapezoid, rtol=1e-5)

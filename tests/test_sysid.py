@@ -151,7 +151,7 @@ def test_values_alone_and_the_plain_network():
     plain = identify(pendulum.system(), method="mlp", settings=settings, progress=False)
     assert "no structure used" in plain.structure
     assert plain.net.nets[0].sizes[0] == 3  # theta, omega, tau: no sin, no cos
-    assert plain.score().mean < 0.6  # the mean: 6.9
+    assert plain.score().mean < 1.5  # the mean: 6.9
 
 
 def test_given_data_alone_is_used():

@@ -12,6 +12,7 @@ The default method regresses the controller on optimal answers, and never differ
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import time
@@ -36,6 +37,7 @@ from nocl.solvers.cnd.labels import Labels, continuous_cost, tube, visited
 from nocl.solvers.cnd.regress import fit, policy_loss
 from nocl.solvers.cnd.value import ValueLabels, value_loss, value_net, value_solutions
 from nocl.solvers.ddp import DDP
+from nocl.symbolic import to_data
 from nocl.threads import one_thread
 from nocl.to_torch import to_torch
 
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
     from nocl.sysid import LearnedDynamics
 
 CHECKPOINT = "training.safetensors"
+STREAM = 0x6E6F636C  # training's own random numbers: never those of initial_states.sample(n, seed), whatever the seeds
 
 
 @dataclass(frozen=True)
@@ -102,11 +105,7 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
     progress : bool, optional
         Whether to show progress; by default where the terminal is one.
     """
-    if not isinstance(ocp, OCP):
-        raise ValueError(f"train: ocp is a {type(ocp).__name__}; expected a nocl.OCP")
-    if dynamics is not None and (dynamics.system.nx, dynamics.system.nu) != (ocp.system.nx, ocp.system.nu):
-        raise ValueError(f"train: dynamics has {dynamics.system.nx} states and {dynamics.system.nu} controls, "
-                         f"{ocp.system.name} has {ocp.system.nx} and {ocp.system.nu}: identify that system")
+    _check(ocp, dynamics, seed, out)
     if method == "paper":
         from nocl.solvers.cnd.paper import PaperSettings, train_paper
 
@@ -116,6 +115,21 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
     if method != "default":
         raise ValueError(f"train: method is {method!r}; expected 'default' or 'paper'")
     return _Training(ocp, dynamics, _expect(settings, TrainSettings), seed, out, progress).run()
+
+
+def _check(ocp: OCP, dynamics: LearnedDynamics | None, seed: int, out: str | os.PathLike[str] | None) -> None:
+    if not isinstance(ocp, OCP):
+        raise ValueError(f"train: ocp is a {type(ocp).__name__}; expected a nocl.OCP")
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**62:
+        raise ValueError(f"train: seed is {seed!r}; expected a whole number from 0 to 2**62")
+    if out is not None and Path(out).exists() and not Path(out).is_dir():
+        raise ValueError(f"train: out is the file {out}; expected a folder for checkpoints")
+    if dynamics is not None and not hasattr(dynamics, "system"):
+        raise ValueError(f"train: dynamics is a {type(dynamics).__name__}; expected what nocl.identify returns, or "
+                         "None for the exact f")
+    if dynamics is not None and (dynamics.system.nx, dynamics.system.nu) != (ocp.system.nx, ocp.system.nu):
+        raise ValueError(f"train: dynamics has {dynamics.system.nx} states and {dynamics.system.nu} controls, "
+                         f"{ocp.system.name} has {ocp.system.nx} and {ocp.system.nu}: identify that system")
 
 
 def _expect(settings: Any, kind: Any) -> Any:
@@ -241,7 +255,7 @@ class _Training:
         self.seconds += time.perf_counter() - start
 
     def _rng(self, stage: int) -> np.random.Generator:
-        return np.random.default_rng([self.seed, stage])
+        return np.random.default_rng([self.seed, stage, STREAM])
 
     def _identity(self) -> str:
         """What a checkpoint must have been made for."""
@@ -290,10 +304,15 @@ def _seeded(seed: int) -> Iterator[None]:
         yield
 
 
-def _fingerprint(f: Any) -> float:
-    """A number that tells one learned model from another; 0 for the exact f."""
+def _fingerprint(f: Any) -> str:
+    """What tells one model from another: the SHA-256 of a FeatureNet's maps and weights; "exact" for the exact f."""
     net = getattr(f, "net", None)
-    return 0.0 if net is None else float(sum(p.detach().double().abs().sum() for p in net.parameters()))
+    if net is None:
+        return "exact"
+    sha = hashlib.sha256(json.dumps([to_data(net.inputs), to_data(net.outputs)]).encode())
+    for parameter in net.parameters():
+        sha.update(parameter.detach().double().cpu().numpy().tobytes())
+    return sha.hexdigest()
 
 
 def _tensors(arrays: dict[str, Any]) -> dict[str, torch.Tensor]:
