@@ -145,6 +145,13 @@ def expression(value: Any, rows: int, allowed: ca.SX, name: str, owner: str, con
     return FrozenSX(ca.densify(value))
 
 
+def problem(ocp: Any, owner: str) -> None:
+    """Raises ValueError for what is no nocl.OCP."""
+    if not (hasattr(ocp, "system") and hasattr(ocp, "initial_states")):
+        raise ValueError(f"{owner}: the problem is a {type(ocp).__name__}; expected a nocl.OCP: "
+                         "nocl.OCP(system, ...) or nocl.load_ocp(name)")
+
+
 def states(x: ArrayLike, nx: int, owner: str, name: str = "x0") -> tuple[Array, bool]:
     """States as float64 rows [B, nx], and whether a single [nx] was given; NaN and other shapes raise ValueError."""
     try:

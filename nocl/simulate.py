@@ -65,6 +65,7 @@ def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: i
 
     Raises ValueError for shapes that do not fit. A state that blows up or a NaN control is a row with success False.
     """
+    checks.problem(ocp, "simulate")
     rows, _ = checks.states(x0, ocp.system.nx, ocp.system.name)
     _check_options(ocp, hold, nodes, t0)
     judge = _Judge(ocp, dynamics_function(ocp, f), rtol, atol)

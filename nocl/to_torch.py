@@ -412,4 +412,6 @@ def to_torch(function: ca.Function) -> TorchFunction:
     MX functions are expanded. Raises ValueError at translation for an operation that torch has not, naming it and the
     function, and at a call for arguments that do not fit.
     """
+    if not isinstance(function, ca.Function):
+        raise ValueError(f"to_torch: got a {type(function).__name__}; expected a casadi.Function, like ocp.system.f")
     return TorchFunction(function)

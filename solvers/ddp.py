@@ -103,6 +103,7 @@ class DDP:
     def __init__(self, ocp: OCP, *, intervals: int = 80, dynamics: LearnedDynamics | None = None,
                  settings: DDPSettings | None = None, threads: int | None = None,
                  cache: str | os.PathLike[str] | None = None) -> None:
+        checks.problem(ocp, "DDP")
         for name, value in (("intervals", intervals), ("threads", 1 if threads is None else threads)):
             if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
                 raise ValueError(f"DDP: {name} is {value!r}; expected an integer >= 1")

@@ -35,6 +35,7 @@ class LQR:
     """
 
     def __init__(self, ocp: OCP, infinite: bool = False) -> None:
+        checks.problem(ocp, "LQR")
         self.ocp, self.infinite = ocp, infinite
         self.A, self.B = ocp.system.linearize(ocp.x_goal, ocp.u_goal)
         self.Q, self.R, self.S, self.P_final = _hessians(ocp)

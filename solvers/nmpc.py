@@ -78,6 +78,7 @@ class NMPC:
     compiled: bool | str | os.PathLike[str] = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
+        checks.problem(self.ocp, "NMPC")
         for name, least in (("intervals", 2), ("substeps", 1), ("starts", 1), ("passes", 0), ("neighbours", 1)):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:

@@ -196,3 +196,13 @@ def test_repr_reads_like_the_problem():
         "OCP on 'toy': horizon 3", "  L = 0.01 tau^2 + theta^2", "  G = theta^2 + omega^2", "  wall: 4 - theta >= 0",
         "  goal: x* = [0, 0], u* = [0]", "  x0 ~ Gaussian(mean=[3, 0], std=[0.1, 0.1])",
         "System 'toy': 2 states, 1 control"]
+
+
+@pytest.mark.parametrize("user", ["LQR", "NMPC", "DDP", "simulate", "to_torch"])
+def test_what_is_no_problem_is_refused_by_name(user):
+    from nocl import solvers
+
+    calls = {"simulate": lambda thing: nocl.simulate(thing, None, [0.0]), "to_torch": nocl.to_torch}
+    for thing in (3, nocl.load_ocp("pendulum").system):
+        with pytest.raises(ValueError, match=r"expected a (nocl.OCP|casadi.Function)"):
+            calls.get(user, getattr(solvers, user, None))(thing)
