@@ -24,7 +24,7 @@ from tqdm import tqdm
 
 from nocl import checks
 from nocl.checks import Array
-from nocl.comparisons.report import Judged, Report, count
+from nocl.comparisons.report import OPEN_LOOP, Judged, Report, count
 from nocl.data import Solution
 from nocl.ocp import OCP
 from nocl.simulate import Simulation, policy_function, simulate
@@ -228,7 +228,7 @@ def _open_loop(ocp: OCP, parts: Sequence[tuple[Any, float] | str], x0: Array, pr
     if solved.any():
         run = _in_chunks(lambda i: simulate(ocp, u[i], x0[i]), ocp, np.flatnonzero(solved), progress, name)
         simulation = _put(simulation, run, solved)
-    how = f"open loop, held on {count(K, 'interval')}"
+    how = f"{OPEN_LOOP}, held on {count(K, 'interval')}"
     return Judged(name, how, simulation, ms, np.full(len(x0), np.nan), solves, predicted)
 
 

@@ -7,11 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from nocl.checks import Array
+from nocl.comparisons import report
 from nocl.ocp import OCP
 from nocl.solvers.bank import better
 from nocl.solvers.ddp import DDP, DDPSolution
 
-NAME = "reference"
+NAME = report.REFERENCE
 
 
 class Reference:

@@ -20,7 +20,10 @@ from nocl.ocp import OCP
 from nocl.simulate import Simulation
 
 COST_FLOOR = 1e-8  # gaps are relative to max(|best cost|, this): costs below it are the judge's rounding
+REFERENCE = "reference"  # the name of a yardstick among the methods: its speed is no method's
+UNSTABLE = 0.05  # a plan that costs more than predicted by this share, in the median, is said to lack feedback
 VIOLATION = 1e-3  # a path constraint below minus this, in its own unit, is violated
+OPEN_LOOP = "open loop"  # how a plan's control was run
 WIDTH = 118  # characters of a line in the terminal
 Row = dict[str, Any]
 Mask = NDArray[np.bool_]
@@ -125,6 +128,7 @@ class Report:
         return {"method": j.name, "how": j.how, "n": len(self.x0), "failures": int((~ok).sum()),
                 "violations": int((ok & ~self.feasible[m]).sum()),
                 "cost_mean": _mean(s.cost[ok]), "cost_median": float(np.median(s.cost)),
+                "predicted_mean": _mean(j.predicted[ok]),
                 "gap_median": percentile(gap, 50), "gap_p95": percentile(gap, 95),
                 "within_1": 100 * float(self.within(1).mean(axis=1)[m]),
                 "within_5": 100 * float(self.within(5).mean(axis=1)[m]),
@@ -172,6 +176,7 @@ def percentile(values: Array, q: float) -> float:
 # label, key(s) that the cell is made of, how it is written
 COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("method", "method", "text"), ("failed", "failures", "count"), ("mean cost", "cost_mean", "number"),
+    ("predicted", "predicted_mean", "number"),
     ("median gap %", "gap_median", "percent"), ("p95 gap %", "gap_p95", "percent"),
     ("within 1 %", "within_1", "share"), ("within 5 %", "within_5", "share"),
     ("terminal error", "terminal_error", "spread"), ("mean |u|", "control_magnitude", "number"),
@@ -180,7 +185,7 @@ COLUMNS: tuple[tuple[str, str, str], ...] = (
 NOTE = (
     "Judged on the exact f under CVODES. Gap: to the best known cost of the same initial state, over all methods here.",
     "ms: one evaluation of a controller, or one solve; a solver that tried several starts took so many solves a state.",
-    "Mean cost, error and |u| are over the runs that did not fail.")
+    "Mean costs, error and |u| are over the runs that did not fail; predicted is what the method itself expected.")
 
 
 def cells(row: Row) -> list[str]:
@@ -228,9 +233,31 @@ def verdict(report: Report) -> list[str]:
     """Who is how near to the best known cost; how fast; what failed."""
     summary = report.summary()
     n = len(report.x0)
+    open_loop = [said for j in report.judged for said in _without_feedback(j)]
+    return [_near(report, summary), *_manners(summary), *open_loop, *_speed(summary), *_failures(summary, n)]
+
+
+def _near(report: Report, summary: Sequence[Row]) -> str:
+    """Who is within 5 % of the best known cost; a method with all the answers is the best known by itself."""
+    n, answers = len(report.x0), report.feasible.sum(axis=1)
+    if np.count_nonzero(answers) == 1:
+        m = int(answers.argmax())
+        return (f"Only {summary[m]['method']} has answers that count, on {_share(100 * answers[m] / n, n)} initial "
+                "states: there is nothing to compare its cost with.")
     near = [f"{row['method']} on {_share(row['within_5'], n)}{_gap_text(row)}" for row in summary]
-    sentence = f"Within 5 % of the best known cost of {count(n, 'initial state')}: " + ", ".join(near) + "."
-    return [sentence, *_manners(summary), *_speed(summary), *_failures(summary, n)]
+    return f"Within 5 % of the best known cost of {count(n, 'initial state')}: " + ", ".join(near) + "."
+
+
+def _without_feedback(judged: Judged) -> list[str]:
+    """Plans that cost more than they predict, in the median: without feedback errors grow, most where f is unstable."""
+    known = np.asarray(judged.simulation.success, dtype=bool) & np.isfinite(judged.predicted)
+    cost, predicted = judged.simulation.cost[known], judged.predicted[known]
+    excess = (cost - predicted) / np.maximum(np.abs(predicted), COST_FLOOR)
+    if not judged.how.startswith(OPEN_LOOP) or not known.any() or np.median(excess) <= UNSTABLE:
+        return []
+    return [f"{judged.name}'s plans predict a cost of {number(_mean(predicted))} on average; run open loop on the "
+            f"exact f they cost {number(_mean(cost))}: what is missing there is feedback, or a finer grid or model, "
+            "not optimality."]
 
 
 def _manners(summary: Sequence[Row]) -> list[str]:
@@ -256,8 +283,10 @@ def count(k: int, what: str) -> str:
 
 
 def _speed(summary: Sequence[Row]) -> list[str]:
-    useful = (row for row in summary if row["within_5"] > 0 and row["ms_per_solve"] > 0)
-    timed = sorted(useful, key=lambda row: row["ms_per_solve"])
+    """The fastest and the slowest of the useful methods; CND and NMPC, where both are there."""
+    useful = [row for row in summary if row["within_5"] > 0 and row["ms_per_solve"] > 0 and row["method"] != REFERENCE]
+    pair = [row for row in useful if row["method"] in ("CND", "NMPC")]
+    timed = sorted(pair if len(pair) == 2 else useful, key=lambda row: row["ms_per_solve"])
     if len(timed) < 2:
         return []
     fast, slow = timed[0], timed[-1]

@@ -79,6 +79,7 @@ def test_summary(report):
     assert all(name in text for name in summary)
     assert "LQR on all 6" in report.verdict()[0]
     assert "NMPC: open loop, held on 20 intervals" in report.verdict()[1]
+    assert not any("not optimality" in sentence for sentence in report.verdict())
 
 
 def test_one_is_not_many(ocp):
@@ -140,6 +141,38 @@ def test_a_solver_that_fails_on_some_states_keeps_the_others(ocp):
     assert report.summary()[0]["within_5"] == pytest.approx(100 / 3)
     assert raised["best_method"] == ""
     assert np.isnan(raised["best_cost"])
+    assert report.verdict()[0] == \
+        "Only fragile has answers that count, on 1 of 3 initial states: there is nothing to compare its cost with."
+
+
+def test_a_plan_that_costs_more_than_it_predicts_is_told():
+    """x' = 3 x + u over 4: what the grid gets wrong grows by exp(12) in open loop, and the optimum is not to blame."""
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    system = nocl.System("unstable", x=x, u=u, xdot=3 * x + u, lbu=[-20], ubu=[20], lbx=[-5], ubx=[5])
+    ocp = nocl.OCP.quadratic(system, horizon=4.0, x_goal=[0], u_goal=[0],
+                             initial_states=nocl.Gaussian(mean=[1], std=[0.1]))
+    report = compare(ocp, {"LQR": LQR(ocp), "NMPC": NMPC(ocp, intervals=16, starts=1, passes=0)}, n=3, progress=False)
+    lqr, nmpc = report.summary()
+    assert lqr["predicted_mean"] == pytest.approx(lqr["cost_mean"], rel=1e-5)
+    assert nmpc["predicted_mean"] == np.mean([row["predicted_cost"] for row in report.rows()[3:]])
+    assert nmpc["cost_mean"] > 1.05 * nmpc["predicted_mean"]
+    said = [sentence for sentence in report.verdict() if "not optimality" in sentence]
+    assert len(said) == 1
+    assert said[0].startswith(f"NMPC's plans predict a cost of {nmpc['predicted_mean']:.4g} on average; run open loop")
+
+
+def test_the_reference_and_bystanders_stay_out_of_the_speed(ocp):
+    report = compare(ocp, {name: LQR(ocp) for name in ("CND", "NMPC", "DDP", "reference")}, n=2, progress=False)
+    timed = [dataclasses.replace(j, ms_per_control=np.full(2, ms))
+             for j, ms in zip(report.judged, (0.5, 10.0, 100.0, 1000.0), strict=True)]
+
+    def speed(*judged):
+        return dataclasses.replace(report, judged=judged).verdict()[-2]
+
+    cnd, nmpc, ddp, reference = timed
+    assert speed(*timed) == speed(cnd, nmpc) == "CND has its control in 0.5 ms, NMPC in 10 ms: 20 times faster."
+    assert speed(cnd, ddp, reference) == "CND has its control in 0.5 ms, DDP in 100 ms: 200 times faster."
+    assert "faster" not in speed(cnd, reference)
 
 
 def test_a_run_that_violates_a_constraint_is_never_the_best():
