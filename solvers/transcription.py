@@ -61,7 +61,7 @@ class Transcription:
     backend: str = "ipopt"
     options: tuple[tuple[str, Any], ...] = ()
     terminal: ca.Function | None = None  # (x) or (x, t) -> cost at the last node; default: G
-    library: Path | None = None  # of compiled functions, built where it is missing; default: none, CasADi interprets
+    binary: Path | None = None  # of compiled functions, built where it is missing; default: none, CasADi interprets
 
     @property
     def L(self) -> ca.Function:
@@ -129,11 +129,11 @@ class Transcription:
     @cached_property
     def solver(self) -> ca.Function:
         """The nlpsol, with exact Hessians."""
-        if self.library is None:
+        if self.binary is None:
             return self._nlpsol(self.program, {"expand": self.expandable})
-        if not self.library.exists():
-            build(self._nlpsol(self.program, {}), self.library)  # not expanded: loops over the intervals stay loops
-        return self._nlpsol(str(self.library), {})
+        if not self.binary.exists():
+            build(self._nlpsol(self.program, {}), self.binary)  # not expanded: loops over the intervals stay loops
+        return self._nlpsol(str(self.binary), {})
 
     def _nlpsol(self, problem: Any, options: dict[str, Any]) -> ca.Function:
         s, N, m = self.ocp.system, self.N, self.n_path
@@ -205,7 +205,7 @@ class Transcription:
     @cached_property
     def second(self) -> Transcription:
         """The same program for IPOPT, which tells an infeasible problem from an unfinished solve."""
-        return replace(self, backend="ipopt", options=(), library=None)
+        return replace(self, backend="ipopt", options=(), binary=None)
 
     def violation(self, g: Array, t: Array) -> tuple[float, str]:
         """(largest violation of a constraint, which one: what, state, node, time)."""
