@@ -196,11 +196,6 @@ class LearnedDynamics:
                 f"  networks: {sizes}\n  {self.card.get('score', 'not scored')}")
 
 
-def load_dynamics(folder: str | Path) -> LearnedDynamics:
-    """The model that `LearnedDynamics.save` wrote."""
-    return LearnedDynamics.load(folder)
-
-
 @one_thread()
 def identify(system: System, *, data: Dataset | None = None, method: str = "default", gradients: bool = True,
              seed: int = 0, settings: Settings | PaperSettings | None = None, progress: bool = True,

@@ -148,13 +148,6 @@ class System:
         A, B = self.jacobian(checks.vector(x, self.nx, "x", owner), checks.vector(u, self.nu, "u", owner))
         return A.full(), B.full()
 
-    def wrap(self, x: ArrayLike) -> Array:
-        """States [..., nx] with each declared angle brought to [-pi, pi)."""
-        wrapped = np.array(x, dtype=np.float64)
-        i = list(self.angle_indices)
-        wrapped[..., i] = (wrapped[..., i] + np.pi) % (2 * np.pi) - np.pi
-        return wrapped
-
     def unit(self, name: str) -> str:
         """The unit of a state or control for an axis label, like 'theta [rad]' or just 'theta'."""
         return f"{name} [{self.units[name]}]" if name in self.units else name

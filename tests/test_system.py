@@ -51,13 +51,6 @@ def test_linearize_checks_its_point():
         make().linearize([1, 2, 3], [0])
 
 
-def test_wrap_brings_angles_alone_to_one_turn():
-    x = np.array([[[np.pi, 9.0], [-7.0, -9.0]]])
-    wrapped = make().wrap(x)
-    np.testing.assert_allclose(wrapped, [[[-np.pi, 9], [-7 + 2 * np.pi, -9]]])
-    assert x[0, 0, 0] == np.pi
-
-
 def test_lists_integers_and_numpy_numbers_are_accepted():
     p, v, u = sx("p", "v", "u")
     s = nocl.System("list", x=[p, v], u=[u], xdot=[v, u + 1], lbu=[-1], ubu=np.array([1]), lbx=(-1, -1),

@@ -460,3 +460,23 @@ def test_a_file_is_no_folder_for_checkpoints(tmp_path):
     with pytest.raises(ValueError, match="expected a folder for checkpoints"):
         nocl.train(nocl.load_ocp("double_integrator"), out=tmp_path / "file")
     assert (tmp_path / "file").read_text() == "mine"
+
+
+def test_visited_states_are_kept_in_a_box_that_ends_at_zero(pendulum):
+    """Far out is measured by the larger bound; where every state is, it is said."""
+    from nocl.solvers.cnd.labels import visited
+
+    ocp, _, _, _ = pendulum
+    s = ocp.system
+    shifted = nocl.System("shifted", x=s.x, u=s.u, xdot=s.xdot, lbu=s.lbu, ubu=s.ubu, lbx=s.lbx, ubx=[6.3, 0.0])
+    start = nocl.Gaussian(mean=[3.14, -0.1], std=[0.1, 0.1])
+    problem = nocl.OCP(shifted, horizon=1.0, running=ocp.running, terminal=ocp.terminal, x_goal=[0, 0], u_goal=[0],
+                       initial_states=start)
+    ddp = DDP(problem, intervals=10)
+    bank = SolutionBank.of(ddp, ddp.solve(start.sample(4, 0)))
+    f, rng = nocl.to_torch(shifted.f), np.random.default_rng(0)
+    policy = FeatureNet(ca.Function("phi", [s.x, ca.SX.sym("t")], []), [],
+                        ca.Function("u", [s.x, ca.SX.sym("t")], [ca.SX(0.0)]))
+    assert len(visited(ddp, bank, policy, f, 8, 0.1, rng)) == 8
+    with pytest.raises(ValueError, match="drives every state far out of the box"):
+        visited(ddp, bank, policy, f, 8, 1e9, rng)

@@ -77,7 +77,11 @@ def visited(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, n: 
     t, x = kicked_rollout(ocp, policy, f, x0, kick * bank.scale, rng)
     rows, k = rng.integers(0, len(x), n), rng.integers(0, len(t) - 1, n)
     x, t0 = x[rows, k], t[k]
-    fine = np.isfinite(x).all(axis=1) & (np.abs(x) < 10 * np.abs(np.asarray(ocp.system.ubx))).all(axis=1)
+    far = 10 * np.maximum(np.abs(ocp.system.lbx), np.abs(ocp.system.ubx))
+    fine = (np.abs(x) < far).all(axis=1)  # False for NaN
+    if not fine.any():
+        raise ValueError(f"the controller of {ocp.system.name} drives every state far out of the box: train for more "
+                         "iterations, in a narrower tube (TrainSettings.width) or with smaller pushes (.kick)")
     return answered(ddp, bank, policy, f, x[fine], t0[fine])
 
 

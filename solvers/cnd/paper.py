@@ -143,7 +143,7 @@ def _features(ocp: OCP, t: ca.SX | None, sin_cos: bool) -> ca.SX:
 
 
 def train_paper(ocp: OCP, dynamics: Any = None, settings: PaperSettings | None = None, seed: int = 0, *,
-                progress: bool = True, device: str | torch.device = "cpu", dtype: torch.dtype = torch.float32,
+                progress: bool | None = True, device: str | torch.device = "cpu", dtype: torch.dtype = torch.float32,
                 callback: Callable[[int, Mapping[str, float]], None] | None = None,
                 ) -> tuple[FeatureNet, FeatureNet, dict[str, Any]]:
     """(controller u(x, t), value V(x, t), card) by the paper's method; both networks in float64 on the CPU.
@@ -152,7 +152,7 @@ def train_paper(ocp: OCP, dynamics: Any = None, settings: PaperSettings | None =
     ----------
     dynamics : None for the exact f, a LearnedDynamics, or any torch callable (x [B, nx], u [B, nu]) -> xdot
     seed : of initial networks and initial states; the caller's own generators are left alone
-    progress : a bar with the loss terms and the time left
+    progress : a bar with the loss terms and the time left; None: where the terminal is one
     callback : called as callback(iteration, terms) after each iteration of the joint training
 
     The card holds settings, seed, seconds, evaluations of the dynamics, the race and the terms' history: data only.
@@ -173,9 +173,10 @@ def train_paper(ocp: OCP, dynamics: Any = None, settings: PaperSettings | None =
 class _Trainer:
     """One training: the problem in torch, and its random numbers."""
 
-    def __init__(self, ocp: OCP, dynamics: Any, settings: PaperSettings, seed: int, progress: bool,
+    def __init__(self, ocp: OCP, dynamics: Any, settings: PaperSettings, seed: int, progress: bool | None,
                  device: str | torch.device, dtype: torch.dtype) -> None:
-        self.ocp, self.settings, self.progress, self.device, self.dtype = ocp, settings, progress, device, dtype
+        self.ocp, self.settings, self.device, self.dtype = ocp, settings, device, dtype
+        self.hidden = None if progress is None else not progress  # None: where the terminal is none
         self.f = _torch_dynamics(ocp, dynamics, device, dtype)
         self.L, self.G = to_torch(ocp.L_soft), to_torch(ocp.G)
         fused = settings.fused and settings.step == "rk4" and dynamics is None and torch.device(device).type == "cpu"
@@ -210,7 +211,7 @@ class _Trainer:
         policy, parameters = _side_by_side(self.starts)
         adam = torch.optim.Adam(parameters.values(), lr=s.learning_rate)
         recent: list[Tensor] = []
-        for _ in (bar := tqdm(range(s.race_iterations), f"{s.race} random controllers", disable=not self.progress)):
+        for _ in (bar := tqdm(range(s.race_iterations), f"{s.race} random controllers", disable=self.hidden)):
             J = self.costs(policy, self.states(s.race, s.race_batch), hold=True).mean(1)
             gradients = torch.autograd.grad(J.sum(), list(parameters.values()))
             _step(adam, list(parameters.values()), _clip_each(gradients, s.clip))
@@ -233,7 +234,7 @@ class _Trainer:
         adam = torch.optim.Adam([p for group in groups for p in group], lr=s.learning_rate)
         held_out, every = self.states(HELD_OUT), max(1, s.iterations // CHECKS)
         best, rows, bad = _Best(), [], 0
-        for k in (bar := tqdm(range(s.iterations), f"CND on {self.ocp.system.name}", disable=not self.progress)):
+        for k in (bar := tqdm(range(s.iterations), f"CND on {self.ocp.system.name}", disable=self.hidden)):
             terms = self.losses(policy, value)
             gradients = torch.autograd.grad(terms.total(s.weights), groups[0] + groups[1], materialize_grads=True)
             rows.append([float(v.detach()) for v in terms.terms()])

@@ -150,7 +150,8 @@ class _Training:
         self.fine = DDP(ocp, intervals=4 * settings.intervals, dynamics=dynamics)
         self.checkpoint = None if out is None else Path(out) / CHECKPOINT
         self.hidden_progress = None if progress is None else not progress
-        self.round, self.history, self.seconds = 0, [dict[str, Any]() for _ in range(0)], 0.0
+        self.round, self.seconds = 0, 0.0
+        self.history: list[dict[str, Any]] = []
 
     def run(self) -> CND:
         with one_thread():
