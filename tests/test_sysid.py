@@ -10,7 +10,8 @@ import torch
 import nocl
 from nocl import fit
 from nocl.data import Dataset
-from nocl.sysid import LearnedDynamics, PaperSettings, Settings, _Draws, _weights, identify
+from nocl.sysid import LearnedDynamics, PaperSettings, Settings, identify
+from nocl.sysid_networks import Draws, weights_of
 from nocl.systems import acrobot, cartpole, dubins, pendulum, quadrotor
 
 SMALL = Settings(iterations=150, polish=12, polish_batch=256, samples=20_000)
@@ -167,15 +168,15 @@ def test_given_data_alone_is_used():
 
 def test_paper_loss_is_the_papers():
     """Mean over the batch of ||f_theta - f|| + ||grad f_theta - grad f||, checked with finite differences."""
+    from nocl import sysid_paper
     from nocl.nets import MLP
-    from nocl.sysid import _paper_loss
 
     torch.manual_seed(0)
     mlp, z, h = MLP([3, 8, 8, 2], "sine").double(), torch.randn(4, 3).double(), 1e-6
     f, J = torch.randn(4, 2).double(), torch.randn(4, 2, 3).double()
     columns = [(mlp(z + h * e) - mlp(z - h * e)) / (2 * h) for e in torch.eye(3).double()]
     want = (mlp(z) - f).norm(dim=1).mean() + (torch.stack(columns, 2) - J).flatten(1).norm(dim=1).mean()
-    torch.testing.assert_close(_paper_loss(mlp, z, f, J), want, rtol=1e-7, atol=0)
+    torch.testing.assert_close(sysid_paper.loss(mlp, z, f, J), want, rtol=1e-7, atol=0)
 
 
 def test_paper_method_learns():
@@ -257,7 +258,7 @@ def test_gauss_newton_is_automatic_differentiation():
 
 def test_levenberg_marquardt_lowers_the_residual():
     samples = wave()
-    draws = _Draws(samples, 1.0, torch.Generator().manual_seed(0))
+    draws = Draws(samples, 1.0, torch.Generator().manual_seed(0))
     start = fit.initial(3, 12, samples, torch.Generator().manual_seed(0))
     history: list[float] = []
     end = fit.levenberg_marquardt(start, draws, steps=25, batch=400, report=history.append)
@@ -269,7 +270,7 @@ def test_levenberg_marquardt_lowers_the_residual():
 
 def test_soap_lowers_the_loss():
     samples = wave().to(torch.float32)
-    draws = _Draws(samples, 1.0, torch.Generator().manual_seed(0))
+    draws = Draws(samples, 1.0, torch.Generator().manual_seed(0))
     start = fit.initial(3, 12, samples, torch.Generator().manual_seed(0))
     end = fit.soap(start, draws, iterations=300, batch=128, lr=1e-2, report=lambda _: None)
     batch, scale = draws(400)
@@ -281,7 +282,7 @@ def test_random_directions_are_unbiased():
     v, m = 6, 1
     samples = fit.Samples(torch.zeros(10, v), torch.ones(10, v), torch.arange(v), torch.zeros(10, m),
                           torch.arange(1.0, v + 1).expand(10, m, v))
-    draws = _Draws(samples, 1.0, torch.Generator().manual_seed(0))
+    draws = Draws(samples, 1.0, torch.Generator().manual_seed(0))
     squares = [((b.y[1:] * s[1:]) ** 2).mean() for b, s in (draws(1) for _ in range(3000))]
     assert float(torch.stack(squares).mean()) == pytest.approx(1.0, rel=0.05)
 
@@ -289,7 +290,7 @@ def test_random_directions_are_unbiased():
 def test_weights_of_a_layered_network_come_back(model):
     for net in model.net.nets:
         phi = torch.randn(4, net.sizes[0], dtype=torch.float64)
-        torch.testing.assert_close(fit.forward(_weights(net), phi[None])[0], net(phi), rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(fit.forward(weights_of(net), phi[None])[0], net(phi), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.slow

@@ -1,0 +1,174 @@
+"""The networks of a structure: their features and normalised samples, their training, and f_theta put together."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import casadi as ca
+import numpy as np
+import torch
+from torch import Tensor
+
+from nocl import fit
+from nocl.checks import Array
+from nocl.nets import MLP, FeatureNet
+from nocl.structure import Box, Group, Structure
+from nocl.sysid_labels import Pool, Source, draw_pool
+from nocl.sysid_progress import Checkpoint, Progress
+from nocl.sysid_settings import Settings
+
+MAX_POLISHED = 2600  # parameters: beyond, a Levenberg-Marquardt step costs more than it gives
+FULL_JACOBIAN = 4  # variables up to which every derivative is supervised, beyond it random directions
+
+
+def fit_groups(source: Source, parts: Structure, settings: Settings, seed: int, bar: Progress,
+                checkpoint: Checkpoint) -> list[fit.Weights]:
+    """The weights of each group's network, in the units of its entries."""
+    if not parts.groups:
+        return []
+    pool = draw_pool(source, parts, settings, np.random.default_rng((seed, 1)))
+    weights = []
+    for i in range(len(parts.groups)):
+        done = checkpoint.get(i)
+        weights.append(fit_group(source.box, parts, pool, i, settings, seed, bar) if done is None else done)
+        if done is None:
+            checkpoint.put(i, weights[-1])
+    return weights
+
+
+def fit_group(box: Box, parts: Structure, pool: Pool, index: int, settings: Settings, seed: int,
+               bar: Progress, old: fit.Weights | None = None) -> fit.Weights:
+    """Train one network, from `old` weights without SOAP's large steps; its weights in the units of its labels."""
+    group = parts.groups[index]
+    samples, mean, spread = _samples(box, group, pool, index, settings.angles)
+    generator = torch.Generator().manual_seed(seed * 1000 + index)
+    draws = Draws(samples, settings.gradient_weight, generator)
+    budget = settings.budget(len(group.variables))
+    if old is None:
+        weights = fit.initial(samples.phi.shape[1], budget.width, samples, generator)
+    else:
+        weights = [old[0], old[1], _scaled(old, -mean / spread, 1 / spread)]
+    polish = budget.polish if sum(w.numel() for w in weights) <= MAX_POLISHED else 0
+    iterations = 0 if old is not None and polish else budget.iterations
+    title = f"network {index + 1}/{len(parts.groups)}"
+    if iterations:
+        with bar.stage(f"{title}, SOAP", iterations) as report:
+            weights = fit.soap([w.float() for w in weights], draws.to(torch.float32), iterations=iterations,
+                               batch=budget.batch, lr=settings.lr if old is None else settings.lr / 4, report=report)
+    if polish:
+        with bar.stage(f"{title}, Levenberg-Marquardt", polish) as report:
+            weights = fit.levenberg_marquardt(weights, draws, steps=polish, batch=budget.polish_batch, report=report)
+    weights = [w.double() for w in weights]
+    return [*weights[:2], _scaled(weights, mean, spread)]
+
+
+def _scaled(weights: fit.Weights, shift: Array, scale: Array) -> Tensor:
+    """W3 of the network whose answers are shift + scale * those of this one."""
+    W3 = weights[2].double() * torch.from_numpy(scale)[:, None]
+    W3[:, weights[1].shape[0]] += torch.from_numpy(shift)
+    return W3
+
+
+def _features(box: Box, group: Group, z: ca.SX, angles: bool) -> tuple[list[ca.SX], list[int]]:
+    """(phi: sin and cos of angles and scaled others, the place in the group of the variable that each depends on)."""
+    phi, owner = [], []
+    for i, k in enumerate(group.variables):
+        scaled = (z[k] - _centre(box)[k]) / _spread(box)[k]
+        new = [ca.sin(z[k]), ca.cos(z[k])] if angles and k in box.angles else [scaled]
+        phi += new
+        owner += [i] * len(new)
+    return phi, owner
+
+
+def _centre(box: Box) -> Array:
+    return (box.lb + box.ub) / 2
+
+
+def _spread(box: Box) -> Array:
+    """The standard deviation of uniform samples: the unit in which variables and derivatives are measured."""
+    return box.width / np.sqrt(12)
+
+
+def _samples(box: Box, group: Group, pool: Pool, index: int, angles: bool) -> tuple[fit.Samples, Array, Array]:
+    """(normalised samples of a group, the mean and spread that its labels were normalised by)."""
+    z = ca.SX.sym("z", box.nz)
+    phi, owner = _features(box, group, z, angles)
+    unit = _spread(box)[list(group.variables)]
+    slopes = [ca.jacobian(p, z[group.variables[i]]) * unit[i] for p, i in zip(phi, owner, strict=True)]
+    value, slope = ca.Function("phi", [z], [ca.vertcat(*phi), ca.densify(ca.vertcat(*slopes))])(pool.z.T)
+    y, dy = pool.value[index], None if pool.gradient is None else pool.gradient[index]
+    mean = y.mean(axis=0)
+    spread = np.sqrt(np.square(y - mean).mean(axis=0))
+    spread = np.where(spread > 1e-12 * np.abs(y).max(axis=0), spread, 1.0)
+    as_tensor = torch.from_numpy
+    return (fit.Samples(as_tensor(value.full().T), as_tensor(slope.full().T), torch.tensor(owner),
+                        as_tensor((y - mean) / spread),
+                        None if dy is None else as_tensor(dy * unit / spread[:, None])), mean, spread)
+
+
+class Draws:
+    """Random batches of samples, with the scale of each residual: value 1, derivatives in units of their spread."""
+
+    def __init__(self, samples: fit.Samples, weight: float, generator: torch.Generator) -> None:
+        self.samples, self.generator = samples, generator
+        self.variables = 0 if samples.dy is None or not weight else samples.dy.shape[2]
+        m, dtype = samples.y.shape[1], samples.y.dtype
+        self.scale = torch.ones(1, 1, m, dtype=dtype)
+        if samples.dy is None or not weight:
+            return
+        rms = samples.dy.square().mean(dim=0).sqrt()  # [m, v]
+        if self.variables <= FULL_JACOBIAN:
+            each = weight / rms.clamp(min=0.05).T[:, None, :]  # [v, 1, m]
+        else:
+            each = (weight / rms.square().sum(dim=1).sqrt().clamp(min=0.05)).expand(2, 1, m)
+        self.scale = torch.cat([self.scale, each])
+
+    def __call__(self, n: int) -> tuple[fit.Batch, Tensor]:
+        rows = torch.randint(len(self.samples), (n,), generator=self.generator)
+        return self.samples.batch(rows, self._directions()), self.scale
+
+    def _directions(self) -> Tensor:
+        """The axes, or two random orthogonal directions of length sqrt(v)."""
+        v = self.variables
+        if v <= FULL_JACOBIAN:
+            return torch.eye(v)
+        return torch.linalg.qr(torch.randn(v, 2, generator=self.generator))[0].T * v**0.5
+
+    def to(self, dtype: torch.dtype) -> Draws:
+        copy = object.__new__(Draws)
+        copy.__dict__ = dict(self.__dict__, samples=self.samples.to(dtype), scale=self.scale.to(dtype))
+        return copy
+
+
+def weights_of(mlp: MLP) -> fit.Weights:
+    """The three weight matrices of a network that `_mlp` made."""
+    s = mlp.state_dict()
+    return [torch.cat([s["body.0.weight"], s["body.0.bias"][:, None]], 1),
+            torch.cat([s["body.2.weight"], s["body.2.bias"][:, None]], 1),
+            torch.cat([s["body.4.weight"], s["body.4.bias"][:, None], s["skip.weight"]], 1)]
+
+
+def _mlp(weights: fit.Weights) -> MLP:
+    """The network of three weight matrices as layers."""
+    W1, W2, W3 = weights
+    h, F = W1.shape[0], W1.shape[1] - 1
+    with torch.device("meta"):  # leaves the caller's random generator alone
+        mlp = MLP([F, h, h, W3.shape[0]], "sine", skip=True)
+    state = {"body.0.weight": W1[:, :F], "body.0.bias": W1[:, F], "body.2.weight": W2[:, :h], "body.2.bias": W2[:, h],
+             "body.4.weight": W3[:, :h], "body.4.bias": W3[:, h], "skip.weight": W3[:, h + 1:]}
+    mlp.load_state_dict({k: v.double().contiguous().clone() for k, v in state.items()}, assign=True)
+    return mlp
+
+
+def assemble(parts: Structure, weights: Sequence[fit.Weights], angles: bool) -> FeatureNet:
+    """f_theta: features, the groups' networks, and the known part with the affine controls as the output map."""
+    box = parts.split.box
+    x, u = ca.SX.sym("x", box.nx), ca.SX.sym("u", box.nz - box.nx)
+    z = ca.vertcat(x, u)
+    phi = [ca.vertcat(*_features(box, g, z, angles)[0]) for g in parts.groups]
+    y = [ca.SX.sym(f"y{i}", len(g.coefficients)) for i, g in enumerate(parts.groups)]
+    learned = {c: a[j] for g, a in zip(parts.groups, y, strict=True) for j, c in enumerate(g.coefficients)}
+    inputs = ca.Function("features", [x, u], phi, ["x", "u"], [f"phi{i}" for i in range(len(phi))])
+    names = ["x", "u", *(f"y{i}" for i in range(len(y)))]
+    outputs = ca.Function("xdot", [x, u, *y], [parts.xdot(learned, z)], names, ["xdot"])
+    return FeatureNet(inputs, [_mlp(w) for w in weights], outputs).eval()

@@ -1,0 +1,96 @@
+"""Budgets and sizes of system identification, checked on construction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from nocl.nets import ACTIVATIONS
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Of one network; more for functions of more variables."""
+
+    width: int  # of its two hidden layers
+    iterations: int  # of SOAP
+    batch: int
+    polish: int  # Levenberg-Marquardt steps
+    polish_batch: int
+
+    @staticmethod
+    def of(variables: int) -> Budget:
+        """What was enough for bundled systems: functions of one variable take seconds, of four about two minutes."""
+        if variables <= 1:
+            return Budget(16, 500, 256, 60, 512)
+        if variables <= 2:
+            return Budget(24, 2000, 1024, 40, 1024)
+        if variables <= 4:
+            return Budget(32, 3000, 1024, 60, 1024)
+        return Budget(48 if variables <= 6 else 96, 6000, 1024, 40, 1024)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Of methods "default" and "mlp". None: by the number of a network's variables, as in Budget.of."""
+
+    width: int | None = None
+    iterations: int | None = None
+    batch: int | None = None
+    polish: int | None = None  # Levenberg-Marquardt steps; none for networks of more than 2,600 parameters
+    polish_batch: int | None = None
+    lr: float = 4e-3  # of SOAP, cosine schedule
+    samples: int = 200_000  # labels of f to draw (with data: all of it is used, and no more)
+    gradient_weight: float = 1.0  # of derivatives beside values, each in units of its own spread
+    structure: bool = True  # read the structure off the Jacobian labels first
+    features: bool = True  # look for polynomials in variables and sin, cos of angles
+    angles: bool = True  # networks see angles as sin and cos
+    probes: int = 64  # points at which the structure is looked for, for each variable
+
+    def __post_init__(self) -> None:
+        given = [n for n in ("width", "batch", "polish_batch") if getattr(self, n) is not None]
+        _positive(self, (*given, "samples", "probes"), integer=True)
+        _positive(self, [n for n in ("iterations", "polish") if getattr(self, n) is not None], integer=True, zero=True)
+        _positive(self, ("lr",))
+        _positive(self, ("gradient_weight",), zero=True)
+
+    def budget(self, variables: int) -> Budget:
+        """The budget of a network of so many variables."""
+        own = {name: getattr(self, name) for name in Budget.__dataclass_fields__}
+        return replace(Budget.of(variables), **{name: value for name, value in own.items() if value is not None})
+
+
+@dataclass(frozen=True)
+class PaperSettings:
+    """Of method "paper": a three-layer MLP (two hidden layers), Adam, exponentially decaying rate."""
+
+    width: int = 64
+    layers: int = 3  # of weights
+    activation: str = "sine"
+    iterations: int = 50_000
+    batch: int = 1024
+    lr: float = 0.01
+    final_lr: float = 1e-5
+    samples: int = 200_000
+
+    def __post_init__(self) -> None:
+        _positive(self, ("width", "iterations", "batch", "samples"), integer=True)
+        _positive(self, ("lr", "final_lr"))
+        if not isinstance(self.layers, int) or self.layers < 2:
+            raise ValueError(f"PaperSettings: layers is {self.layers!r}; expected an integer >= 2")
+        if self.activation not in ACTIVATIONS:
+            raise ValueError(f"PaperSettings: activation is {self.activation!r}; "
+                             f"expected one of {', '.join(ACTIVATIONS)}")
+
+
+def _positive(settings: Any, names: Sequence[str], *, integer: bool = False, zero: bool = False) -> None:
+    for name in names:
+        value = getattr(settings, name)
+        kind = int if integer else (int, float)
+        good = isinstance(value, kind) and not isinstance(value, bool) and np.isfinite(value)
+        if not good or value < 0 or (value == 0 and not zero):
+            what = f"{'an integer' if integer else 'a number'} {'>= 0' if zero else '> 0'}"
+            raise ValueError(f"{type(settings).__name__}: {name} is {value!r}; expected {what}")
