@@ -29,8 +29,9 @@ class System:
         A plain identifier; it names files and CasADi functions.
     x, u : casadi.SX
         Columns of scalar symbols; their names are the names of the states and controls.
-    xdot : casadi.SX
-        nx expressions in these symbols and nothing else.
+    xdot : casadi.SX or None
+        nx expressions in these symbols and nothing else; None where the equations are not known: logs teach them
+        (nocl.identify with `data`).
     lbu, ubu : [nu]
         Hard control bounds U, finite.
     lbx, ubx : [nx]
@@ -48,7 +49,7 @@ class System:
     name: str
     x: ca.SX
     u: ca.SX
-    xdot: ca.SX
+    xdot: ca.SX | None
     lbu: Vector = field(kw_only=True)
     ubu: Vector = field(kw_only=True)
     lbx: Vector = field(kw_only=True)
@@ -67,13 +68,15 @@ class System:
         if repeated:
             raise ValueError(f"{owner}: {', '.join(repeated)} occurs more than once in x and u; "
                              "expected a symbol and a name of its own for each state and control")
-        z = ca.vertcat(self.x, self.u)
-        self._set(xdot=checks.expression(checks.column(self.xdot), self.nx, z, "xdot", owner))
+        if self.xdot is not None:
+            z = ca.vertcat(self.x, self.u)
+            self._set(xdot=checks.expression(checks.column(self.xdot), self.nx, z, "xdot", owner))
         lbu, ubu = checks.bounds(self.lbu, self.ubu, self.nu, ("lbu", "ubu"), owner, self.control_names)
         lbx, ubx = checks.bounds(self.lbx, self.ubx, self.nx, ("lbx", "ubx"), owner, self.state_names)
         self._set(lbu=lbu, ubu=ubu, lbx=lbx, ubx=ubx)
         self._check_names(owner)
-        self._check_finite(owner)
+        if self.xdot is not None:
+            self._check_finite(owner)
 
     def _set(self, **values: object) -> None:
         for key, value in values.items():
@@ -131,15 +134,24 @@ class System:
     def angle_indices(self) -> tuple[int, ...]:
         return tuple(self.state_names.index(a) for a in self.angles)
 
+    @property
+    def equations(self) -> ca.SX:
+        """xdot; ValueError where it is not known."""
+        if self.xdot is None:
+            raise ValueError(f"the equations of {self.name!r} are not known (xdot=None), and are needed here: learn "
+                             "them from logs, model = nocl.identify(system, data=log), and pass the model, or a "
+                             "problem on model.to_system()")
+        return self.xdot
+
     @cached_property
     def f(self) -> ca.Function:
         """(x [nx], u [nu]) -> xdot [nx]."""
-        return ca.Function("f", [self.x, self.u], [self.xdot], ["x", "u"], ["xdot"])
+        return ca.Function("f", [self.x, self.u], [self.equations], ["x", "u"], ["xdot"])
 
     @cached_property
     def jacobian(self) -> ca.Function:
         """(x, u) -> (A [nx, nx] = df/dx, B [nx, nu] = df/du), dense."""
-        A, B = (ca.densify(ca.jacobian(self.xdot, v)) for v in (self.x, self.u))
+        A, B = (ca.densify(ca.jacobian(self.equations, v)) for v in (self.x, self.u))
         return ca.Function("jacobian", [self.x, self.u], [A, B], ["x", "u"], ["A", "B"])
 
     def linearize(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
@@ -156,10 +168,13 @@ class System:
         def interval(name: str, low: float, high: float) -> str:
             return f"{name} in [{low:g}, {high:g}]" + (" (angle)" if name in self.angles else "")
 
-        rows, shared = pretty.lines(self.xdot, ca.vertcat(self.x, self.u))
         lines = [f"System {self.name!r}: {counted(self.nx, 'state')}, {counted(self.nu, 'control')}"]
-        lines += [pretty.wrapped(f"d{n}/dt", e) for n, e in zip(self.state_names, rows, strict=True)]
-        lines += [pretty.wrapped(name, e, "    ") for name, e in shared.items()]
+        if self.xdot is None:
+            lines.append("equations not known")
+        else:
+            rows, shared = pretty.lines(self.xdot, ca.vertcat(self.x, self.u))
+            lines += [pretty.wrapped(f"d{n}/dt", e) for n, e in zip(self.state_names, rows, strict=True)]
+            lines += [pretty.wrapped(name, e, "    ") for name, e in shared.items()]
         lines.append(pretty.filled("X: " + ", ".join(map(interval, self.state_names, self.lbx, self.ubx))))
         lines.append(pretty.filled("U: " + ", ".join(map(interval, self.control_names, self.lbu, self.ubu))))
         return "\n".join(lines)
@@ -167,7 +182,8 @@ class System:
     def to_data(self) -> dict[str, Any]:
         """The system as plain JSON data, exact to the last bit."""
         return {"name": self.name, "x": list(self.state_names), "u": list(self.control_names),
-                "f": symbolic.to_data(self.f), "angles": list(self.angles), "units": dict(self.units),
+                "f": None if self.xdot is None else symbolic.to_data(self.f),
+                "angles": list(self.angles), "units": dict(self.units),
                 **{name: getattr(self, name).tolist() for name in ("lbu", "ubu", "lbx", "ubx")}}
 
     @staticmethod
@@ -175,7 +191,7 @@ class System:
         """The system that to_data wrote, with new symbols; ValueError for anything else."""
         try:
             x, u = (ca.vertcat(*map(ca.SX.sym, data[names])) for names in ("x", "u"))
-            xdot = symbolic.from_data(data["f"], [x, u])(x, u)
+            xdot = None if data["f"] is None else symbolic.from_data(data["f"], [x, u])(x, u)
             return System(data["name"], x=x, u=u, xdot=xdot, angles=data["angles"], units=data["units"],
                           **{name: data[name] for name in ("lbu", "ubu", "lbx", "ubx")})
         except (KeyError, TypeError, AttributeError, NotImplementedError, RuntimeError) as error:

@@ -54,7 +54,7 @@ class _Stage:
         z, n = ca.vertcat(x, u), x.numel() + 1
         self.mu = ca.SX.sym("mu", n)
         phi, y, Jy, Hy, self.net = _network_symbols(net, x, u)
-        xdot = ocp.system.xdot if net is None else net.outputs(x, u, *y)
+        xdot = ocp.system.equations if net is None else net.outputs(x, u, *y)
         self.rhs = ca.vertcat(xdot, ocp.L_soft(x, u))
         yz = ca.vertcat(*(J @ ca.jacobian(p, z) for J, p in zip(Jy, phi, strict=True)))
         ys = ca.vertcat(*y)
