@@ -15,7 +15,8 @@ if TYPE_CHECKING:
 
 METHODS = ("CND", "NMPC", "LQR", "DDP")
 SOLVERS = ("nmpc", "ddp", "lqr")
-FORMS = ("casadi", "l4casadi", "c")
+FORMS = ("casadi", "l4casadi", "onnx", "c")
+QUICK_PROOF = ("casadi", "onnx", "c")  # of a run: L4CasADi takes half a minute to build
 MOST = 1_000_000  # of anything counted on the command line
 SEEDS = 2**62  # so that seeds made from one still fit in 64 bits
 INTERRUPTED = 130  # 128 + SIGINT, as shells have it
@@ -84,9 +85,11 @@ def parser() -> argparse.ArgumentParser:
     sub = command("solve", _solve, "solve the problem from many initial states")
     _add(sub, "problem", "out", "seed", "n", "intervals")
     sub.add_argument("--solver", choices=SOLVERS, default="nmpc", help="default: nmpc")
-    sub = command("export", _export, "write a run's controller, value function and dynamics as CasADi files or C")
+    sub = command("export", _export, "write a run's controller, value function and dynamics, proven equal to it")
     _add(sub, "run")
     sub.add_argument("--to", choices=FORMS, action="append", help="default: casadi and c; may be given several times")
+    sub.add_argument("--against", type=_forms, metavar="A,B", help="what is compared beside them; default: all of "
+                     f"{', '.join(FORMS)} that can be made here")
     sub.add_argument("--out", type=_folder, metavar="DIR", help="default: RUN/export")
     sub = command("compare", _compare, "compare a run's controller with other methods, initial state by initial state")
     _add(sub, "run", "n", "intervals", "methods")
@@ -150,6 +153,13 @@ def _methods(text: str) -> tuple[str, ...]:
     return names
 
 
+def _forms(text: str) -> tuple[str, ...]:
+    names = tuple(word.strip().lower() for word in text.split(","))
+    if not set(names) <= set(FORMS):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a list of {', '.join(FORMS)}")
+    return names
+
+
 def _list(args: argparse.Namespace) -> None:
     from nocl.systems import NAMES, load_ocp
 
@@ -199,8 +209,20 @@ def _run(args: argparse.Namespace) -> None:
     stages.check(exact=args.exact)
     _other_methods(ocp, args.methods, args.intervals)
     cnd = stages.train(exact=args.exact)
-    stages.export(cnd, out / "export", ("casadi", "c"))
+    failed = _told(lambda: stages.export(cnd, out / "export", ("casadi", "c"), QUICK_PROOF))
     stages.compare(cnd, out / "report", args.methods, args.n, args.intervals)
+    if failed:
+        raise failed
+
+
+def _told(stage: Callable[[], None]) -> ValueError | None:
+    """The error of a stage that later ones do not need, told at once."""
+    try:
+        stage()
+    except ValueError as error:
+        print(_one_line(error), flush=True)
+        return error
+    return None
 
 
 def _identify(args: argparse.Namespace) -> None:
@@ -235,7 +257,7 @@ def _export(args: argparse.Namespace) -> None:
     cnd = load_run(run)
     out = args.out if args.out is not None else run / "export"
     _check_out(out)
-    Stages(cnd.ocp, run, 0, False).export(cnd, out, tuple(dict.fromkeys(args.to or ("casadi", "c"))))
+    Stages(cnd.ocp, run, 0, False).export(cnd, out, tuple(dict.fromkeys(args.to or ("casadi", "c"))), args.against)
 
 
 def _compare(args: argparse.Namespace) -> None:

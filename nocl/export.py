@@ -18,6 +18,7 @@ from nocl import parity, store
 from nocl.checks import Array
 from nocl.parity import Certificate, Finding, Part
 from nocl.sysid import LearnedDynamics
+from nocl.system import System
 from nocl.to_casadi import to_casadi
 
 FORMS = ("casadi", "l4casadi", "onnx", "c")
@@ -26,7 +27,17 @@ NEEDS = {"l4casadi": ("l4casadi",), "onnx": ("onnx", "onnxruntime")}  # packages
 
 
 def parts_of(thing: Any) -> list[Part]:
-    """The functions of a controller (an object with `parts()`) or of learned dynamics; ValueError for others."""
+    """The functions of a controller (an object with `parts()`), of learned dynamics or of a list of these.
+
+    Raises ValueError for others, and for a list with two functions of one name or of different systems.
+    """
+    if isinstance(thing, (list, tuple)) and thing:
+        parts = [part for one in thing for part in parts_of(one)]
+        names, systems = [part.name for part in parts], {_system(one).name for one in thing}
+        if len(set(names)) < len(names) or len(systems) > 1:
+            raise ValueError(f"export: got the functions {', '.join(names)} of {', '.join(sorted(systems))}; expected "
+                             "different ones of one system: export the others to another folder")
+        return parts
     if hasattr(thing, "parts") and callable(thing.parts):
         made: list[Part] = thing.parts()
         return made
@@ -37,12 +48,12 @@ def parts_of(thing: Any) -> list[Part]:
                   "xdot": [f"d {n} / dt" for n in s.state_names]}
         net = copy.deepcopy(thing.net).double().eval()
         return [Part("dynamics", thing.to_casadi(), net, box, labels, net)]
-    raise ValueError(f"export: got a {type(thing).__name__}; expected a CND or LearnedDynamics")
+    raise ValueError(f"export: got a {type(thing).__name__}; expected a CND, LearnedDynamics or a list of them")
 
 
 def export(thing: Any, folder: str | os.PathLike[str], to: Sequence[str] = ("casadi",), *,
            against: Sequence[str] | None = None) -> Certificate:
-    """Write a CND or LearnedDynamics to `folder` in the forms of `to`, and prove them equal to it.
+    """Write a CND, LearnedDynamics or a list of them to `folder` in the forms of `to`, and prove them equal to it.
 
         folder/NAME.casadi            to="casadi": ca.Function.load reads it
         folder/l4casadi/NAME.casadi   to="l4casadi", with what it needs in l4casadi/lib: do not move the folder
@@ -84,9 +95,14 @@ def export(thing: Any, folder: str | os.PathLike[str], to: Sequence[str] = ("cas
     return certificate
 
 
+def _system(thing: Any) -> System:
+    found: System = thing.system if isinstance(thing, LearnedDynamics) else thing.ocp.system
+    return found
+
+
 def _title(thing: Any) -> tuple[str, str]:
-    system = thing.system if isinstance(thing, LearnedDynamics) else thing.ocp.system
-    return system.name, repr(thing).split("\n")[0]
+    things = thing if isinstance(thing, (list, tuple)) else [thing]
+    return _system(things[0]).name, "; ".join(repr(one).split("\n")[0] for one in things)
 
 
 def _missing() -> dict[str, str]:

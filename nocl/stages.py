@@ -1,7 +1,7 @@
 """The main job's stages in a run's folder, for the command line: each is made once, and taken up where it stands.
 
 dynamics/   the learned dynamics                              cnd/      controller and value function
-export/     policy.casadi, value.casadi, dynamics.casadi, c/  report/   report.html, rows.csv, summary.json, figures/
+export/     *.casadi, c/, c_float32/, parity.json             report/   report.html, rows.csv, summary.json, figures/
 checkpoint/ what an interrupted stage goes on from; gone once it is finished
 """
 
@@ -10,17 +10,14 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import os
 import shutil
 import time
-import uuid
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 
 from nocl import __version__, store
@@ -89,29 +86,15 @@ class Stages:
         say(f"controller: done, {time.perf_counter() - start:.0f} s")
         return cnd
 
-    def export(self, cnd: CND, out: Path, forms: Sequence[str]) -> None:
-        """The controller, the value function and the learned dynamics, where there are any, in each of the forms."""
-        start = time.perf_counter()
-        learned = "casadi" in forms and cnd.card.get("dynamics") == "learned"
-        model = self._dynamics_there() if learned else None  # all is read before the first file is written
-        for form in forms:
-            if form == "c":
-                cnd.to_c(out / "c")
-            else:
-                self._export_casadi(cnd, model if form == "casadi" else None, out, form)
-        say(f"export: {', '.join(forms)} in {out}, {time.perf_counter() - start:.1f} s")
+    def export(self, cnd: CND, out: Path, forms: Sequence[str], against: Sequence[str] | None) -> None:
+        """Controller, value function and, where there are any, learned dynamics, with the proof of parity."""
+        from nocl.export import export
 
-    def _export_casadi(self, cnd: CND, model: LearnedDynamics | None, out: Path, form: str) -> None:
-        """L4CasADi's functions call their libraries, which therefore stay beside them."""
-        native, folder = form == "casadi", out if form == "casadi" else out / form
-        backend, build = ("native", None) if native else (form, folder / "lib")
-        functions = {"policy": cnd.to_casadi(backend, build)}
-        if cnd.value_net is not None:
-            functions["value"] = cnd.value_to_casadi(backend, build)
-        if model is not None:
-            functions["dynamics"] = model.to_casadi()
-        for name, function in functions.items():
-            save_function(function, folder / f"{name}.casadi")
+        start = time.perf_counter()
+        model = self._dynamics_there() if cnd.card.get("dynamics") == "learned" else None
+        say(f"export: {', '.join(forms)} to {out}")
+        certificate = export([cnd] if model is None else [cnd, model], out, forms, against=against)
+        say(f"export: {certificate}, {time.perf_counter() - start:.1f} s")
 
     def compare(self, cnd: CND, out: Path, methods: Sequence[str], n: int, intervals: int,
                 hold: int | None = None) -> None:
@@ -244,15 +227,3 @@ def _write_arrays(path: Path, arrays: dict[str, Any]) -> Path:
     file = io.BytesIO()
     np.savez_compressed(file, **arrays)
     return store.write_bytes(path, file.getvalue())
-
-
-def save_function(function: ca.Function, path: Path) -> Path:
-    """Write a .casadi file atomically; it loads by ca.Function.load in the same or a newer CasADi."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(f".{path.stem}.{uuid.uuid4().hex}.part")
-    try:
-        function.save(str(part))
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
-    return path

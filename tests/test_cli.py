@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import nocl
-from nocl import stages
+from nocl import parity, stages
 from nocl.cli import main
 from nocl.solvers import NMPC
 from nocl.solvers.cnd import CND, TrainSettings
@@ -90,6 +90,7 @@ BAD = [
     ("export half", "holds no cnd.safetensors"),
     ("export other", "cut off"),
     ("export half --to cobol", "cobol"),
+    ("export half --against cobol", "cobol"),
     ("compare missing", "no folder missing"),
     ("compare notes.txt", "no folder notes.txt"),
     ("compare half --hold 0", "at least 1"),
@@ -226,7 +227,13 @@ def test_a_run_from_a_users_file_to_its_report(here, capsys, monkeypatch):
     assert "report: out/report/report.html" in out
     assert "Within 5 % of the best known cost of 2 initial states: CND" in out
     assert {p.name for p in run.iterdir()} == {"dynamics", "cnd", "export", "report"}
-    assert {p.name for p in (run / "export").iterdir()} == {"policy.casadi", "value.casadi", "dynamics.casadi", "c"}
+    functions = ("policy", "gain", "closed_loop", "value", "value_gradient", "dynamics")
+    assert {p.name for p in (run / "export").iterdir()} == {"c", "c_float32", "parity.json",
+                                                            *(f"{name}.casadi" for name in functions)}
+    proof = json.loads((run / "export" / "parity.json").read_text())
+    assert proof["ok"]
+    assert {f["part"] for f in proof["findings"]} == set(functions)
+    assert {f["backend"] for f in proof["findings"]} == {"native CasADi", "ONNX Runtime", "ONNX imported", "C"}
     cnd = CND.load(run / "cnd")
     policy = ca.Function.load(str(run / "export" / "policy.casadi"))
     x = np.array([1.0, 0.1])
@@ -240,6 +247,14 @@ def test_a_run_from_a_users_file_to_its_report(here, capsys, monkeypatch):
     assert "dynamics: taken from out/dynamics" in out
     assert "controller: taken from out/cnd" in out
     assert {p: p.stat().st_mtime_ns for p in before} == before
+
+    with monkeypatch.context() as patch:  # an export that fails does not cost the report
+        patch.setitem(parity.LIMITS, "float64", 0.0)
+        assert main([*RUN[:-3], "2", "--intervals", "10"]) == 2
+        out, err = capsys.readouterr()
+        assert "nothing was written: the export is not what was trained" in out
+        assert "differs from torch" in err
+        assert "report: out/report/report.html" in out
 
     damaged = run / "dynamics" / "dynamics.safetensors"
     whole = damaged.read_bytes()
@@ -262,8 +277,9 @@ def test_a_run_from_a_users_file_to_its_report(here, capsys, monkeypatch):
     assert main(["compare", "out", "--n", "2", "--methods", "CND", "--seed", "7"]) == 0
     assert "drawn with seed 8" in capsys.readouterr().out
     assert (here / "elsewhere" / "report.html").is_file()
-    assert main(["export", "out", "--to", "c", "--out", "source"]) == 0
-    assert {p.name for p in (here / "source").iterdir()} == {"c"}
+    assert main(["export", "out", "--to", "onnx", "--against", "casadi", "--out", "source"]) == 0
+    assert {p.name for p in (here / "source").iterdir()} == {"onnx", "parity.json"}
+    assert "parity ok: policy" in capsys.readouterr().out
 
 
 def test_a_controller_that_no_run_made_is_not_overwritten(here, capsys, monkeypatch):
