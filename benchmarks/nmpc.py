@@ -1,6 +1,7 @@
 """NMPC beside what else a user would pick: the same problem, discretisation, start and tolerance, in one go.
 
     python benchmarks/nmpc.py --others /path/to/venv/bin/python   # with do-mpc, rockit-meco and casadi in that venv
+    python benchmarks/nmpc.py --acados /path/to/other/bin/python  # with comma-deps-acados, then casadi in that venv
     python benchmarks/nmpc.py --sections share --problems dubins  # best of 32 IPOPT starts against NMPC's search
     python benchmarks/nmpc.py --sections parallel                 # 1,000 cart-pole states on one and on two cores
 
@@ -13,6 +14,8 @@ Results go to --out, JSON with command, commit, versions, machine and seeds.
 from __future__ import annotations
 
 import argparse
+import contextlib
+import ctypes
 import importlib.metadata
 import json
 import os
@@ -30,7 +33,8 @@ import numpy as np
 ROOT = Path(__file__).resolve().parents[1]
 PROBLEMS = ("cartpole", "acrobot", "quadrotor", "dubins")
 OTHERS = ("do-mpc", "rockit ipopt", "rockit fatrop")
-TOOLS = ("nocl ipopt", "nocl fatrop", "nocl fatrop compiled", "opti ipopt", *OTHERS)
+ACADOS = "acados sqp"
+TOOLS = ("nocl ipopt", "nocl fatrop", "nocl fatrop compiled", "opti ipopt", *OTHERS, ACADOS)
 TOL, MAX_ITER = 1e-9, 500
 SAME = 1e-3  # relative: costs this close are the same optimum
 KICK = 0.01  # of the spread of initial states: how far the warm-started state is from the solved one
@@ -168,10 +172,71 @@ def tool_rockit(p: Problem, solver: str):
     return solve
 
 
+def acados_template():
+    """acados' Python interface, of its own distribution or of the wheel comma-deps-acados.
+
+    That wheel is for an own venv (it ships a casadi, which pip install casadi replaces); it looks for its libraries by
+    environment variables, and for its templates in a folder that its wheel does not have: hence the link.
+    """
+    try:
+        import acados_template as found
+    except ImportError:
+        import acados
+        os.environ |= {"ACADOS_SOURCE_DIR": acados.DIR, "TERA_PATH": acados.TERA_PATH}
+        for library in ("blasfeo", "hpipm", "qpOASES_e", "acados"):
+            ctypes.CDLL(f"{acados.LIB_DIR}/lib{library}.so", mode=ctypes.RTLD_GLOBAL)
+        link = Path(acados.DIR, "interfaces", "acados_template", "acados_template")
+        if not link.exists():
+            link.parent.mkdir(parents=True, exist_ok=True)
+            link.symlink_to(acados.TEMPLATE_DIR)
+        import acados.acados_template as found
+        sys.modules["acados_template"] = found
+    return found
+
+
+def tool_acados(p: Problem, folder: str):
+    """acados: SQP with HPIPM, exact Hessians made convex by mirroring, the common RK4 step as discrete dynamics."""
+    at = acados_template()
+    ocp, x, u, h = at.AcadosOcp(), ca.SX.sym("x", p.nx), ca.SX.sym("u", p.nu), p.T / p.N
+    end, stage = p.step(x, u, h)
+    m = ocp.model
+    m.name, m.x, m.u, m.disc_dyn_expr = "problem", x, u, end
+    m.cost_expr_ext_cost, m.cost_expr_ext_cost_e = stage / h, p.G(x)  # acados multiplies stage costs by h
+    ocp.cost.cost_type = ocp.cost.cost_type_e = "EXTERNAL"
+    c, o = ocp.constraints, ocp.solver_options
+    c.lbu, c.ubu, c.idxbu, c.x0 = p.lbu, p.ubu, np.arange(p.nu), p.x0[0]
+    if p.n_path:  # at inner nodes and at the end; the other tools leave out the first node, which x0 fixes
+        m.con_h_expr = m.con_h_expr_e = p.h(x)
+        c.lh = c.lh_e = np.zeros(p.n_path)
+        c.uh = c.uh_e = np.full(p.n_path, 1e9)
+    ocp.dims.N, o.tf, o.integrator_type, o.nlp_solver_type = p.N, p.T, "DISCRETE", "SQP"
+    o.qp_solver, o.hessian_approx, o.regularize_method = "PARTIAL_CONDENSING_HPIPM", "EXACT", "MIRROR"
+    o.globalization, o.nlp_solver_max_iter, o.tol = "MERIT_BACKTRACKING", MAX_ITER, 1e-6
+    ocp.code_export_directory = f"{folder}/acados"
+    with contextlib.chdir(folder):
+        solver = at.AcadosOcpSolver(ocp, json_file=f"{folder}/acados.json")
+
+    def solve(x0, guess, _):
+        solver.reset()
+        solver.constraints_set(0, "lbx", x0)
+        solver.constraints_set(0, "ubx", x0)
+        for k in range(p.N + 1):
+            solver.set(k, "x", guess[0][k])
+        for k in range(p.N):
+            solver.set(k, "u", guess[1][k])
+        status = solver.solve()
+        return (np.array([solver.get(k, "x") for k in range(p.N + 1)]),
+                np.array([solver.get(k, "u") for k in range(p.N)]), status == 0)
+
+    return solve
+
+
 def build(tool: str, p: Problem, cache: str):
     name, _, rest = tool.partition(" ")
     if name == "nocl":
         return tool_nocl(p, rest.split()[0], **({"compiled": cache} if "compiled" in rest else {}))
+    if tool == ACADOS:
+        return tool_acados(p, cache)
     return tool_opti(p) if name == "opti" else tool_dompc(p) if name == "do-mpc" else tool_rockit(p, rest)
 
 
@@ -197,7 +262,7 @@ def child(tool: str, source: str, target: str, cache: str) -> None:
             result[f"{kind}cost"].append(p.cost(start, guess[1]))
             result[f"{kind}ok"].append(bool(ok))
     names = {"nocl": ("casadi", "numpy"), "opti": ("casadi",), "do-mpc": ("do-mpc", "casadi"),
-             "rockit": ("rockit-meco", "casadi")}[tool.split()[0]]
+             "rockit": ("rockit-meco", "casadi"), "acados": ("comma-deps-acados", "casadi")}[tool.split()[0]]
     result["versions"] = {n: importlib.metadata.version(n) for n in names}
     Path(target).write_text(json.dumps(result))
 
@@ -226,9 +291,9 @@ def tools(args: argparse.Namespace, name: str) -> dict:
         source, target = Path(folder, "problem.json"), Path(folder, "result.json")
         source.write_text(json.dumps(data))
         for tool in args.tools:
-            python = args.others if tool in OTHERS else sys.executable
+            python = args.others if tool in OTHERS else args.acados if tool == ACADOS else sys.executable
             if python is None:
-                rows[tool] = {"skipped": "no --others PYTHON"}
+                rows[tool] = {"skipped": "no --acados PYTHON" if tool == ACADOS else "no --others PYTHON"}
                 continue
             target.unlink(missing_ok=True)
             run = subprocess.run([python, __file__, "--child", tool, str(source), str(target), folder],
@@ -330,6 +395,7 @@ def main() -> None:
     parser.add_argument("--problems", nargs="+", default=list(PROBLEMS), choices=PROBLEMS)
     parser.add_argument("--tools", nargs="+", default=list(TOOLS), choices=TOOLS)
     parser.add_argument("--others", help="a Python that has do-mpc, rockit-meco and casadi")
+    parser.add_argument("--acados", help="a Python that has acados_template (or comma-deps-acados) and casadi")
     parser.add_argument("--states", type=int, default=40)
     parser.add_argument("--many", type=int, default=1000, help="states of the section parallel")
     parser.add_argument("--intervals", type=int, default=80)
