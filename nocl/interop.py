@@ -1,4 +1,4 @@
-"""Systems and problems for other tools: python-control, gymnasium, do-mpc, all optional; CasADi Functions taken in."""
+"""Systems and problems for other tools: python-control, gymnasium, do-mpc, acados, all optional; Functions taken in."""
 
 from __future__ import annotations
 
@@ -80,6 +80,19 @@ def to_do_mpc(system: System) -> Any:
     for name, rate in zip(system.state_names, ca.vertsplit(system.f(x, u)), strict=True):
         model.set_rhs(name, rate)
     model.setup()
+    return model
+
+
+def to_acados(system: System) -> Any:
+    """acados' AcadosModel of the system: x, u, xdot, explicit and implicit equations, in SX."""
+    try:
+        model = package("acados_template").AcadosModel()
+    except ValueError as error:
+        raise ValueError(f"{error}, or acados' own interfaces/acados_template") from None
+    model.name, model.x, model.u = system.name, ca.SX(system.x), ca.SX(system.u)
+    model.xdot = ca.SX.sym("xdot", system.nx)
+    model.f_expl_expr = system.f(model.x, model.u)
+    model.f_impl_expr = model.xdot - model.f_expl_expr
     return model
 
 

@@ -218,6 +218,12 @@ class System:
 
         return to_do_mpc(self)
 
+    def to_acados(self) -> Any:
+        """acados' AcadosModel of the same equations (needs acados_template)."""
+        from nocl.interop import to_acados
+
+        return to_acados(self)
+
     def __reduce__(self) -> tuple[Any, ...]:
         return System.from_data, (self.to_data(),)  # bare SX does not pickle
 

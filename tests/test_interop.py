@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -115,6 +117,23 @@ def test_do_mpc_gets_the_equations(ocp):
     assert model.n_x == 4
 
 
+def test_acados_gets_the_equations(ocp, monkeypatch):
+    class AcadosModel:  # acados' own is a plain record, too
+        pass
+
+    try:
+        import acados_template  # noqa: F401
+    except ImportError:
+        monkeypatch.setitem(sys.modules, "acados_template", SimpleNamespace(AcadosModel=AcadosModel))
+    model, f = ocp.system.to_acados(), ocp.system.f
+    equations = ca.Function("equations", [model.x, model.u, model.xdot], [model.f_expl_expr, model.f_impl_expr])
+    x, u = np.array([0.1, 0.2, 0.3, 0.4]), 0.5
+    explicit, implicit = equations(x, u, f(x, u))
+    np.testing.assert_allclose(explicit.full(), f(x, u).full(), rtol=1e-14)
+    np.testing.assert_allclose(implicit.full(), 0.0, atol=1e-14)
+    assert model.name == "cartpole"
+
+
 @pytest.mark.parametrize("options", [{"steps": 0}, {"integrator": "euler"}])
 def test_refusals(ocp, options):
     with pytest.raises(ValueError, match=next(iter(options))):
@@ -123,8 +142,8 @@ def test_refusals(ocp, options):
 
 def test_missing_packages_say_how_to_install_them(ocp, monkeypatch):
     modules = __import__("sys").modules
-    for name in ("control", "gymnasium", "do_mpc"):
+    for name in ("control", "gymnasium", "do_mpc", "acados_template"):
         monkeypatch.setitem(modules, name, None)
-    for call in (ocp.system.to_control, ocp.to_gymnasium, ocp.system.to_do_mpc):
+    for call in (ocp.system.to_control, ocp.to_gymnasium, ocp.system.to_do_mpc, ocp.system.to_acados):
         with pytest.raises(ValueError, match="pip install"):
             call()
