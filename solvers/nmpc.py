@@ -50,8 +50,8 @@ class NMPC:
     terminal : cost at the window's end in place of G: a casadi.Function (x) or (x, t) -> number, or an object with
         `value_to_casadi()`, such as a trained value function
     starts : guesses tried for each state, beyond those that `solve` is given
-    passes : rounds in which states of one batch are solved again from their neighbours' solutions and, where the
-        problem has a mirror image, from the mirrored ones
+    passes : rounds in which states of one batch are solved again from their neighbours' solutions, where the problem
+        has a mirror image from the mirrored ones, and from any other state's, until a round improves nothing
     neighbours : how many in each round
     constraints : "hard": path constraints at the nodes; "soft": the penalty of ocp.L_soft in the cost instead
     seed : of the random starts
@@ -143,6 +143,8 @@ class NMPC:
         """
         s = self.ocp.system
         rows, _ = checks.states(x0, s.nx, s.name)
+        if not len(rows):
+            raise ValueError(f"x0 has shape {np.shape(x0)}; expected at least one state")
         t = self._nodes(t0, nodes)
         tried = [one for one in (guesses if isinstance(guesses, list) else [guesses]) if one is not None]
         tried.sort(key=lambda one: not _is_solution(one))
@@ -275,7 +277,8 @@ class _Run:
         for round_ in range(1, self.nmpc.passes + 1):
             tasks = [Task(f"round-{round_}-{i:06d}", i, self.x0[i], self.t, guesses)
                      for i, search in enumerate(self.searches)
-                     if not search.refusal and (guesses := list(self._from_neighbours(i, order[i], tried)))]
+                     if not search.refusal and (guesses := [*self._from_neighbours(i, order[i], tried),
+                                                            *self._from_afar(i, round_)])]
             before = [search.cost for search in self.searches]
             self._do(tasks, f"neighbours, round {round_}")
             if not any(search.cost < cost - max(BETTER * abs(search.cost), TINY)
@@ -305,6 +308,15 @@ class _Run:
             if image >= 0:
                 x, u = starting.mirrored(self.nmpc.ocp, _mirrors(self.nmpc.ocp)[image], x, u)
             yield starting.from_neighbour(self.x0[i], x, u)
+
+    def _from_afar(self, i: int, round_: int) -> Iterator[Guess]:
+        """The solution of any other state: neighbours alone come to rest where a whole region shares a wrong basin."""
+        rng = np.random.default_rng((self.nmpc.seed, round_, i))
+        others = [j for j, search in enumerate(self.searches) if j != i and search.best is not None]
+        if others:
+            answer = self.searches[rng.choice(others)].best
+            assert answer is not None
+            yield starting.from_neighbour(self.x0[i], answer.x, answer.u)
 
     def _do(self, tasks: Sequence[Task], what: str) -> None:
         for outcome in do(_Job(self.nmpc), tasks, self.pool, self.journal, self.show, what):

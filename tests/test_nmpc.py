@@ -268,3 +268,28 @@ def test_bad_input(call, words):
     nmpc = NMPC(nocl.load_ocp("double_integrator"), 10)
     with pytest.raises(ValueError, match=words):
         call(nmpc)
+
+
+def two_valleys():
+    """The plane, x' = u, over a hill between start and goal, with ground that costs more on the right of it."""
+    p, q, a, b = (ca.SX.sym(name) for name in "pqab")
+    plane = nocl.System("plane", x=ca.vertcat(p, q), u=ca.vertcat(a, b), xdot=ca.vertcat(a, b), lbu=[-9, -9],
+                        ubu=[9, 9], lbx=[-3, -3], ubx=[3, 3])
+    ground = 3 * ca.exp(-4 * (p**2 + q**2)) + 1 / (1 + ca.exp(-20 * p))
+    return nocl.OCP(plane, horizon=1.0, running=0.02 * (a**2 + b**2) + ground, terminal=20 * (p**2 + (q - 1) ** 2),
+                    x_goal=[0, 1], u_goal=[0, 0], initial_states=nocl.Gaussian(mean=[0, -1], std=[0.3, 0.1]))
+
+
+def test_a_region_that_shares_a_wrong_basin_is_told_by_states_from_afar():
+    ocp = two_valleys()
+    x0 = np.c_[np.r_[np.linspace(0.3, 0.5, 6), -0.5, -0.3], np.full(8, -1.0)]  # neighbours of the first six: each other
+    alone = NMPC(ocp, 20, starts=1, passes=0).solve(x0, workers=1)
+    ours = NMPC(ocp, 20, starts=1).solve(x0, workers=1)
+    many = NMPC(ocp, 20, starts=40, passes=0).solve(x0[:2], workers=1)
+    assert (alone.cost[:6] > 1.5 * ours.cost[:6]).all()
+    np.testing.assert_allclose(ours.cost[:2], many.cost, rtol=1e-6)
+
+
+def test_no_states_are_refused():
+    with pytest.raises(ValueError, match=r"x0 has shape \(0, 2\); expected at least one state"):
+        NMPC(two_valleys(), 20).solve(np.zeros((0, 2)))
