@@ -8,7 +8,8 @@ Three kinds of control are judged alike:
   of K equal intervals, its answer held;
 - open loop, where it is an array u [B, K, nu]: held.
 
-The judge clips every control to U, and starts CVODES anew wherever a control or a state jumps.
+The judge clips every control to U, and starts CVODES anew wherever a control or a state jumps. Path constraints are
+judged between the nodes too, at BETWEEN times in each interval.
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from nocl.ocp import OCP
 
 Kicks = Sequence[tuple[float, ArrayLike]]
 METHODS = ("adams", "bdf")  # the second, for stiff loops, where the first gives up; same tolerances
+BETWEEN = 8  # times in an interval that path constraints are judged at
 AT_BOUND = 1e-9  # of the width of U: closer than this counts as saturated
 
 
@@ -44,13 +46,14 @@ class Simulation:
     terminal_error: Array  # [B], ||x(T) - x*||_2
     control_magnitude: Array  # [B], mean of ||u||_2 over time
     saturation: Array  # [B], share of time with a control at a bound
-    clearance: Array  # [B], min of all path constraints over the nodes; inf if the problem has none
+    clearance: Array  # [B], min of all path constraints, at and between nodes; inf if the problem has none
     success: Array  # [B] bool
     message: Sequence[str]  # [B], "" or what failed, at which time and state
 
 
 def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: int | None = None, nodes: int = 81,
-             kicks: Kicks | None = None, t0: float = 0.0, rtol: float = 1e-9, atol: float = 1e-10) -> Simulation:
+             kicks: Kicks | None = None, delay: float = 0.0, t0: float = 0.0, rtol: float = 1e-9,
+             atol: float = 1e-10) -> Simulation:
     """Run and score a controller on an OCP from states x0 [nx] or [B, nx].
 
     Parameters
@@ -61,6 +64,8 @@ def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: i
     hold : K, sample the feedback at K equal intervals; default: continuous where it can be, else nodes - 1
     nodes : number of nodes that continuous feedback is recorded at
     kicks : (time, dx [nx] or [B, nx]), added to the state at that time
+    delay : time from a sample of the state to its control, at most an interval; the last control acts meanwhile. The
+        first control is there at once: where a run starts is known before it does
     t0 : start, so that a tail of the horizon can be judged
 
     Raises ValueError for shapes that do not fit. A state that blows up or a NaN control is a row with success False.
@@ -72,12 +77,15 @@ def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: i
     jumps = _jumps(ocp, kicks, len(rows), t0)
     policy = policy_function(ocp, controller)
     if policy is not None and hold is None:
+        _check_delay(delay, 0.0, "continuous feedback: give `hold`")
         return judge.continuous(policy, rows, np.linspace(t0, ocp.horizon, nodes), jumps)
     if isinstance(controller, (np.ndarray, list, tuple)):
         ask, K = _open_loop(ocp, controller, len(rows), hold, t0)
+        _check_delay(delay, 0.0, "open loop, which samples nothing")
     else:
         ask, K = _feedback(ocp, controller, policy), hold or nodes - 1
-    return judge.held(ask, rows, np.linspace(t0, ocp.horizon, K + 1), jumps)
+        _check_delay(delay, (ocp.horizon - t0) / K, f"feedback that is sampled {K} times: sample it less often")
+    return judge.held(ask, rows, np.linspace(t0, ocp.horizon, K + 1), jumps, delay)
 
 
 def dynamics_function(ocp: OCP, f: Any) -> ca.Function:
@@ -118,6 +126,11 @@ def _check_options(ocp: OCP, hold: int | None, nodes: int, t0: float) -> None:
         raise ValueError(f"nodes is {nodes!r}; expected an integer >= 2")
     if not 0 <= t0 < ocp.horizon:
         raise ValueError(f"t0 is {t0!r}; expected 0 <= t0 < {ocp.horizon:g}, the horizon")
+
+
+def _check_delay(delay: float, most: float, of: str) -> None:
+    if not 0 <= delay <= most * (1 + 1e-9):
+        raise ValueError(f"delay is {delay!r}; expected 0 <= delay <= {most:g} for {of}")
 
 
 def _jumps(ocp: OCP, kicks: Kicks | None, B: int, t0: float) -> list[tuple[float, Array]]:
@@ -199,7 +212,8 @@ class _Judge:
         return u - ca.fmax(u - s.ubu, 0) + ca.fmax(s.lbu - u, 0)
 
     def continuous(self, policy: ca.Function, x0: Array, t: Array, jumps: list[tuple[float, Array]]) -> Simulation:
-        dae, B, nx = self.feedback_dae(policy), len(x0), x0.shape[1]
+        dae, B, nx, nodes, m = self.feedback_dae(policy), len(x0), x0.shape[1], t, self.between
+        t = np.interp(np.arange((len(nodes) - 1) * m + 1) / m, np.arange(len(nodes)), nodes)  # m times an interval
         x = np.full((B, len(t), nx), np.nan)
         z, magnitude, message = np.c_[x0, np.zeros(B)], np.zeros(B), [""] * B
         edges = np.unique(np.r_[t[0], [time for time, _ in jumps], t[-1]])
@@ -215,15 +229,16 @@ class _Judge:
                     magnitude[i] += magnitude_i
         z[:, :nx] += sum(dx for time, dx in jumps if time == t[-1])
         x[:, -1] = z[:, :nx]
+        dense, x, t = x, x[:, ::m].copy(), nodes
         u = policy(x.reshape(-1, nx).T, np.tile(t, B)[None]).full().T.reshape(B, len(t), -1)
         u = np.clip(u, self.ocp.system.lbu, self.ocp.system.ubu)
         weight = np.gradient(t) * np.r_[0.5, np.ones(len(t) - 2), 0.5] if len(t) > 2 else np.diff(t).repeat(2) / 2
         saturation = self.at_bound(u) @ (weight / weight.sum())
-        return self.score(t, x, u, z[:, -1], magnitude / (t[-1] - t[0]), saturation, message)
+        return self.score(t, x, u, z[:, -1], magnitude / (t[-1] - t[0]), saturation, self.clearance(dense), message)
 
-    def held(self, ask: Ask, x0: Array, t: Array, jumps: list[tuple[float, Array]]) -> Simulation:
+    def held(self, ask: Ask, x0: Array, t: Array, jumps: list[tuple[float, Array]], delay: float = 0.0) -> Simulation:
         B, nx, K, nu = len(x0), x0.shape[1], len(t) - 1, self.ocp.system.nu
-        step = _Step(self)
+        step, clearance = _Step(self), np.full(B, np.inf)
         x, u = np.full((B, K + 1, nx), np.nan), np.full((B, K + 1, nu), np.nan)
         z, message = np.c_[x0, np.zeros(B)], [""] * B
         for k in range(K):
@@ -234,14 +249,17 @@ class _Judge:
             for i in np.flatnonzero(alive & ~np.isfinite(u[:, k]).all(axis=1)):
                 message[i] = _failure("the control is NaN", t[k], z[i, :nx])
             middle = [jump for jump in jumps if t[k] < jump[0] < t[k + 1]]
-            edges = np.r_[t[k], np.unique([time for time, _ in middle]), t[k + 1]]
+            late = t[k] + (delay if k else 0.0)
+            edges = np.unique(np.r_[t[k], [time for time, _ in middle], min(late, t[k + 1]), t[k + 1]])
             for a, b in pairwise(edges):
                 z[:, :nx] += sum(dx for time, dx in middle if time == a)
-                step.run(z, u[:, k], a, b, message)
+                path = step.run(z, u[:, k - 1] if a < late else u[:, k], a, b, message)
+                clearance = np.fmin(clearance, self.clearance(path))
         z[:, :nx] += sum(dx for time, dx in jumps if time == t[-1])
         x[:, -1], u[:, -1] = z[:, :nx], u[:, -2]
         magnitude = np.linalg.norm(u[:, :-1], axis=2).mean(axis=1)
-        return self.score(t, x, u, z[:, -1], magnitude, self.at_bound(u[:, :-1]).mean(axis=1), message)
+        clearance = np.fmin(clearance, self.clearance(x))
+        return self.score(t, x, u, z[:, -1], magnitude, self.at_bound(u[:, :-1]).mean(axis=1), clearance, message)
 
     def at_bound(self, u: Array) -> Array:
         """Whether any control is at a bound, [B, K], as 0 or 1."""
@@ -249,16 +267,26 @@ class _Judge:
         near = AT_BOUND * (s.ubu - s.lbu)
         return ((u <= s.lbu + near) | (u >= s.ubu - near)).any(axis=2).astype(float)
 
+    @property
+    def between(self) -> int:
+        """Times in an interval that the state is recorded at."""
+        return BETWEEN if self.ocp.path_constraints else 1
+
+    def clearance(self, x: Array) -> Array:
+        """[B], min of all path constraints over the states x [B, n, nx] that are finite; inf if there are none."""
+        if not self.ocp.path_constraints:
+            return np.full(len(x), np.inf)
+        h = self.ocp.h(x.reshape(-1, x.shape[2]).T).full().reshape(-1, *x.shape[:2])  # [constraints, B, n]
+        return np.where(np.isfinite(h), h, np.inf).min(axis=(0, 2), initial=np.inf)
+
     def score(self, t: Array, x: Array, u: Array, running: Array, magnitude: Array, saturation: Array,
-              message: list[str]) -> Simulation:
+              clearance: Array, message: list[str]) -> Simulation:
         success = np.array([not m for m in message])
         x[~success, -1] = np.nan
         terminal = np.where(success, self.ocp.G(x[:, -1].T).full().ravel(), np.inf)
         running = np.where(success, running, np.inf)
         error = np.where(success, np.linalg.norm(x[:, -1] - self.ocp.x_goal, axis=1), np.inf)
         u[~np.isfinite(x).all(axis=2)] = np.nan
-        h = self.ocp.h(x.reshape(-1, x.shape[2]).T).full().reshape(-1, *x.shape[:2])  # [constraints, B, K+1]
-        clearance = np.where(np.isfinite(h), h, np.inf).min(axis=(0, 2), initial=np.inf)
         return Simulation(t, x, u, running + terminal, running, terminal, error, np.where(success, magnitude, np.nan),
                           np.where(success, saturation, np.nan), clearance, success, message)
 
@@ -299,19 +327,24 @@ class _Step:
     """Held controls over one interval, state by state: a mapped call is a tenth faster, but fails for all at once."""
 
     def __init__(self, judge: _Judge) -> None:
-        dae = judge.held_dae()
-        self.solvers = [judge.integrator(dae, np.array([1.0]), method) for method in METHODS]
+        dae, self.m = judge.held_dae(), judge.between
+        grid = np.arange(1, self.m + 1) / self.m
+        self.solvers = [judge.integrator(dae, grid, method) for method in METHODS]
 
-    def run(self, z: Array, u: Array, a: float, b: float, message: list[str]) -> None:
-        """Advance the rows of z whose message is empty from time a to b; write a message where one fails."""
-        p = np.c_[u, np.full(len(u), b - a)]
+    def run(self, z: Array, u: Array, a: float, b: float, message: list[str]) -> Array:
+        """Advance the rows of z whose message is empty from time a to b; write a message where one fails.
+
+        Returns the states on the way [B, m, nx], NaN where there are none.
+        """
+        p, path = np.c_[u, np.full(len(u), b - a)], np.full((len(z), self.m, z.shape[1] - 1), np.nan)
         for i in (i for i, m in enumerate(message) if not m):
             ends = (_integrate(solver, z[i], p[i])[0] for solver in self.solvers)
             end = next((e for e in ends if e is not None), None)
             if end is None:
                 message[i] = _failure("the state blows up", a, z[i, :-1], b)
             else:
-                z[i] = end.ravel()
+                path[i], z[i] = end[:-1].T, end[:, -1]
+        return path
 
 
 def _integrate(solver: ca.Function, z: Any, p: Any) -> tuple[Array | None, float]:

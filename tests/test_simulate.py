@@ -12,6 +12,8 @@ from scipy.linalg import expm
 
 import nocl
 from nocl.simulate import simulate
+from nocl.solvers import LQR
+from nocl.systems import double_integrator, dubins
 
 
 def scalar(xdot=lambda x, u: u, running=lambda x, u: x**2 + u**2, horizon=2.0, u_max=1.0):
@@ -235,3 +237,34 @@ def test_control_magnitude_does_not_depend_on_the_nodes():
     trapezoid = np.trapezoid(np.linalg.norm(fine.u, axis=2), fine.t, axis=1) / ocp.horizon
     for nodes in (5, 81):
         np.testing.assert_allclose(simulate(ocp, controller, x0, nodes=nodes).control_magnitude, trapezoid, rtol=1e-5)
+
+
+def test_constraints_are_judged_between_nodes():
+    """Dubins' car drives from (-2, 0) straight through the obstacle at (-1, 0): at both nodes it is well outside."""
+    ocp = dubins.ocp(horizon=2.0)
+    straight = np.array([[[1.0, 0.0]]])
+    assert simulate(ocp, straight, [-2.0, 0.0, 0.0]).clearance == pytest.approx([-0.5], abs=2e-3)
+    x, t = ca.MX.sym("x", 3), ca.MX.sym("t")
+    policy = ca.Function("policy", [x, t], [ca.MX([1.0, 0.0])])
+    result = simulate(ocp, policy, [-2.0, 0.0, 0.0], nodes=2)
+    assert result.clearance == pytest.approx([-0.5], abs=2e-3)
+    assert result.x.shape == (1, 2, 3)
+
+
+def test_a_delayed_control_acts_late():
+    """x' = v, v' = u: u = 0, 1, 2, 3 in turn on [0, 2], each but the first a quarter of an interval late."""
+    ocp, h, delay = double_integrator.ocp(), 0.5, 0.125
+    late = simulate(ocp, lambda x, t: np.full((len(x), 1), round(t / h)), [[0.0, 0.0]], hold=4, delay=delay)
+    switches = np.r_[0.0, h * np.arange(1, 4) + delay, 2.0]
+    v = np.sum(np.diff(switches) * np.arange(4))
+    assert late.x[0, -1, 1] == pytest.approx(v, rel=1e-8)
+    whole = simulate(ocp, lambda x, t: np.full((len(x), 1), round(t / h)), [[0.0, 0.0]], hold=4, delay=h)
+    assert whole.x[0, -1, 1] == pytest.approx(h * (0 + 0 + 1 + 2), rel=1e-8)
+
+
+def test_a_delay_that_cannot_be_is_refused():
+    ocp = double_integrator.ocp()
+    with pytest.raises(ValueError, match="delay is"):
+        simulate(ocp, lambda x, t: np.zeros((len(x), 1)), [0.0, 0.0], hold=4, delay=0.6)
+    with pytest.raises(ValueError, match="give `hold`"):
+        simulate(ocp, LQR(ocp), [0.0, 0.0], delay=0.1)
