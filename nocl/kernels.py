@@ -111,7 +111,7 @@ def _c(value: object) -> Any:
     if value is None:
         return ctypes.c_void_p(None)
     if isinstance(value, np.ndarray):
-        if not value.flags.c_contiguous or value.dtype not in (np.float64, np.int64):
+        if not value.flags.c_contiguous or value.dtype not in (np.float64, np.float32, np.int64):
             raise ValueError(f"a kernel got an array of {value.dtype}, contiguous: {value.flags.c_contiguous}")
         return ctypes.c_void_p(value.ctypes.data)
     return ctypes.c_int64(int(value))  # type: ignore[call-overload]

@@ -166,19 +166,6 @@ def test_given_data_alone_is_used():
     np.testing.assert_allclose(model(x, u).numpy(), want, atol=1e-12)
 
 
-def test_paper_loss_is_the_papers():
-    """Mean over the batch of ||f_theta - f|| + ||grad f_theta - grad f||, checked with finite differences."""
-    from nocl import sysid_paper
-    from nocl.nets import MLP
-
-    torch.manual_seed(0)
-    mlp, z, h = MLP([3, 8, 8, 2], "sine").double(), torch.randn(4, 3).double(), 1e-6
-    f, J = torch.randn(4, 2).double(), torch.randn(4, 2, 3).double()
-    columns = [(mlp(z + h * e) - mlp(z - h * e)) / (2 * h) for e in torch.eye(3).double()]
-    want = (mlp(z) - f).norm(dim=1).mean() + (torch.stack(columns, 2) - J).flatten(1).norm(dim=1).mean()
-    torch.testing.assert_close(sysid_paper.loss(mlp, z, f, J), want, rtol=1e-7, atol=0)
-
-
 def test_paper_method_learns():
     settings = PaperSettings(width=32, iterations=400, batch=256, samples=20_000)
     model = identify(pendulum.system(), method="paper", settings=settings, progress=False)

@@ -1,0 +1,317 @@
+/* The paper's identification loss of a three-layer MLP and its gradient, over a batch: values and full Jacobians.
+
+   The includer defines SINGLE (1: float, 0: double), NZ, NX, H (sizes) and CURVE (SINE, TANH, RELU or SILU). With
+   t1 = W1 z + b1, a1 = s(t1), t2 = W2 a1 + b2, a2 = s(t2), y = W3 a2 + b3, D = diag s'(t), the loss of a sample is
+   |y - f| + |J - df/dz|, J = W3 D2 W2 D1 W1. One sample a vector lane; a tile is T vectors of samples, few enough to
+   stay in the cache. Matrices of a tile are [rows][T] or, of the Jacobian's part, [rows][C] in rows of LD: column o T + t is
+   equation o of vector t. J is built from the output down, its gradient from the input up. */
+#include <math.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+
+#define SINE 0
+#define TANH 1
+#define RELU 2
+#define SILU 3
+
+#if SINGLE
+typedef float real;
+#define F(name) name##f
+#else
+typedef double real;
+#define F(name) name
+#endif
+#if defined(__AVX512F__)
+#define BYTES 64
+#define MVEC(name) F3(_ZGVeN, 16, 8, name)
+#elif defined(__AVX2__)
+#define BYTES 32
+#define MVEC(name) F3(_ZGVdN, 8, 4, name)
+#else
+#define BYTES 16
+#define MVEC(name) F3(_ZGVbN, 4, 2, name)
+#endif
+#if SINGLE
+#define F3(isa, single, twice, name) isa##single##v_##name##f
+#else
+#define F3(isa, single, twice, name) isa##twice##v_##name
+#endif
+#define LANES ((int)(BYTES / sizeof(real)))
+#define T (NX <= 4 ? 8 : NX <= 12 ? 4 : NX <= 24 ? 2 : 1)
+#define C (NX * T)
+#define LD (C | 1)  /* an odd number of vectors between rows: powers of two share the cache's few sets */
+#define INLINE static inline __attribute__((always_inline))
+
+typedef real vec __attribute__((vector_size(BYTES)));
+
+INLINE vec of(real value) { return value - (vec){0}; }
+typedef real quarter __attribute__((vector_size(BYTES / 4)));
+INLINE real sum_of(vec x)
+{
+    union { vec whole; quarter parts[4]; } of = {x};
+    const quarter four = (of.parts[0] + of.parts[1]) + (of.parts[2] + of.parts[3]);
+    real sum = 0;
+    for (int i = 0; i < LANES / 4; ++i) sum += four[i];
+    return sum;
+}
+
+#ifdef WITH_MVEC
+#define EACH(name) extern vec MVEC(name)(vec); static inline vec v_##name(vec x) { return MVEC(name)(x); }
+#else
+#define EACH(name) static inline vec v_##name(vec x) { \
+    vec y; for (int i = 0; i < LANES; ++i) y[i] = F(name)(x[i]); return y; }
+#endif
+EACH(sin) EACH(cos) EACH(tanh) EACH(exp)
+
+/* s(t), s'(t), s''(t) of n vectors; t is overwritten by s. */
+static void curve(int n, vec *t, vec *d, vec *e)
+{
+    for (int i = 0; i < n; ++i) {
+        const vec x = t[i];
+#if CURVE == SINE
+        t[i] = v_sin(x); d[i] = v_cos(x); e[i] = -t[i];
+#elif CURVE == TANH
+        const vec s = v_tanh(x);
+        t[i] = s; d[i] = 1 - s * s; e[i] = -2 * s * d[i];
+#elif CURVE == RELU
+        for (int k = 0; k < LANES; ++k) d[i][k] = x[k] > 0;
+        t[i] = x * d[i]; e[i] = (vec){0};
+#else
+        const vec s = 1 / (1 + v_exp(-x)), slope = s * (1 - s);
+        t[i] = x * s; d[i] = s + x * slope; e[i] = slope * (2 + x * (1 - 2 * s));
+#endif
+    }
+}
+
+/* out[m][c] (+)= sum_k A[m, k] in[k][c], A[m, k] at A[m * sm + k * sk], for a rows x columns block in registers. */
+INLINE void product_block(int rows, int columns, int K, const real *A, int sm, int sk, int ld, const vec *in, vec *out)
+{
+    vec sum[4][4];
+#pragma GCC unroll 4
+    for (int m = 0; m < rows; ++m)
+#pragma GCC unroll 4
+        for (int c = 0; c < columns; ++c) sum[m][c] = (vec){0};
+    for (int k = 0; k < K; ++k)
+#pragma GCC unroll 4
+        for (int m = 0; m < rows; ++m) {
+            const vec a = of(A[m * sm + k * sk]);
+#pragma GCC unroll 4
+            for (int c = 0; c < columns; ++c) sum[m][c] += a * in[k * ld + c];
+        }
+#pragma GCC unroll 4
+    for (int m = 0; m < rows; ++m)
+#pragma GCC unroll 4
+        for (int c = 0; c < columns; ++c) out[m * ld + c] = sum[m][c];
+}
+
+INLINE void product_columns(int columns, int M, int K, const real *A, int sm, int sk, int ld, const vec *in, vec *out)
+{
+    int m = 0;
+    for (; m + 4 <= M; m += 4) product_block(4, columns, K, A + m * sm, sm, sk, ld, in, out + m * ld);
+    for (; m < M; ++m) product_block(1, columns, K, A + m * sm, sm, sk, ld, in, out + m * ld);
+}
+
+INLINE void product(int M, int K, const real *A, int sm, int sk, int n, int ld, const vec *in, vec *out)
+{
+    int c = 0;
+    for (; c + 4 <= n; c += 4) product_columns(4, M, K, A, sm, sk, ld, in + c, out + c);
+    for (; c < n; ++c) product_columns(1, M, K, A, sm, sk, ld, in + c, out + c);
+}
+
+/* gradient[m, k] += the sum over lanes and columns of left[m][c] right[k][c]; gradient [M, K] by rows. */
+INLINE void outer_block(int rows, int columns, int K, int n, int ld, const vec *left, const vec *right, real *gradient)
+{
+    vec sum[4][4];
+#pragma GCC unroll 4
+    for (int m = 0; m < rows; ++m)
+#pragma GCC unroll 4
+        for (int k = 0; k < columns; ++k) sum[m][k] = (vec){0};
+    for (int c = 0; c < n; ++c)
+#pragma GCC unroll 4
+        for (int m = 0; m < rows; ++m)
+#pragma GCC unroll 4
+            for (int k = 0; k < columns; ++k) sum[m][k] += left[m * ld + c] * right[k * ld + c];
+#pragma GCC unroll 4
+    for (int m = 0; m < rows; ++m)
+#pragma GCC unroll 4
+        for (int k = 0; k < columns; ++k) gradient[m * K + k] += sum_of(sum[m][k]);
+}
+
+INLINE void outer_rows(int rows, int K, int n, int ld, const vec *left, const vec *right, real *gradient)
+{
+    int k = 0;
+    for (; k + 4 <= K; k += 4) outer_block(rows, 4, K, n, ld, left, right + k * ld, gradient + k);
+    for (; K % 4 && k < K; ++k) outer_block(rows, 1, K, n, ld, left, right + k * ld, gradient + k);
+}
+
+INLINE void outer(int M, int K, int n, int ld, const vec *left, const vec *right, real *gradient)
+{
+    int m = 0;
+    for (; m + 4 <= M; m += 4) outer_rows(4, K, n, ld, left + m * ld, right, gradient + m * K);
+    for (; M % 4 && m < M; ++m) outer_rows(1, K, n, ld, left + m * ld, right, gradient + m * K);
+}
+
+/* W1 [H, NZ], b1, W2 [H, H], b2, W3 [NX, H], b3, in this order in one array. */
+enum { B1 = H * NZ, W2 = B1 + H, B2 = W2 + H * H, W3 = B2 + H, B3 = W3 + NX * H, PARAMETERS = B3 + NX };
+
+typedef struct {
+    vec z[NZ * T], f[NX * T], dfdz[NZ * LD];  /* labels; dfdz[i][o T + t] */
+    vec a1[H * T], d1[H * T], e1[H * T], a2[H * T], d2[H * T], e2[H * T], y[NX * T];
+    vec G2[H * LD], P[H * LD], G1[H * LD], J[NZ * LD];  /* dy/dt2, dy/da1, dy/dt1, dy/dz */
+    vec G1_bar[H * LD], G2_bar[H * LD];
+    vec t1_bar[H * T], t2_bar[H * T], d1_bar[H * T], d2_bar[H * T];
+} tile;
+
+/* Rows at[0 .. n - 1] of the labels, a lane each; lanes beyond n repeat the last row. */
+static void load(tile *s, const int64_t *at, int64_t n, const real *z, const real *f, const real *dfdz)
+{
+    for (int t = 0; t < T; ++t)
+        for (int lane = 0; lane < LANES; ++lane) {
+            const int64_t own = t * LANES + lane, row = at[own < n ? own : n - 1];
+            for (int i = 0; i < NZ; ++i) s->z[i * T + t][lane] = z[row * NZ + i];
+            for (int o = 0; o < NX; ++o) s->f[o * T + t][lane] = f[row * NX + o];
+            if (dfdz)
+                for (int o = 0; o < NX; ++o)
+                    for (int i = 0; i < NZ; ++i) s->dfdz[i * LD + o * T + t][lane] = dfdz[(row * NX + o) * NZ + i];
+        }
+}
+
+INLINE void add_bias(int M, const real *b, vec *x)
+{
+    for (int m = 0; m < M; ++m)
+        for (int t = 0; t < T; ++t) x[m * T + t] += b[m];
+}
+
+static void values(tile *s, const real *w)
+{
+    product(H, NZ, w, NZ, 1, T, T, s->z, s->a1);
+    add_bias(H, w + B1, s->a1);
+    curve(H * T, s->a1, s->d1, s->e1);
+    product(H, H, w + W2, H, 1, T, T, s->a1, s->a2);
+    add_bias(H, w + B2, s->a2);
+    curve(H * T, s->a2, s->d2, s->e2);
+    product(NX, H, w + W3, H, 1, T, T, s->a2, s->y);
+    add_bias(NX, w + B3, s->y);
+}
+
+static void jacobian(tile *s, const real *w)
+{
+    for (int j = 0; j < H; ++j)
+        for (int o = 0; o < NX; ++o)
+            for (int t = 0; t < T; ++t) s->G2[j * LD + o * T + t] = w[W3 + o * H + j] * s->d2[j * T + t];
+    product(H, H, w + W2, 1, H, C, LD, s->G2, s->P);
+    for (int k = 0; k < H; ++k)
+        for (int o = 0; o < NX; ++o)
+            for (int t = 0; t < T; ++t) s->G1[k * LD + o * T + t] = s->P[k * LD + o * T + t] * s->d1[k * T + t];
+    product(NZ, H, w, 1, NZ, C, LD, s->G1, s->J);
+}
+
+/* Residuals x - label [rows][NX T] in rows of ld, each sample's divided by their norm; 0 in lanes beyond `left`.
+   Returns the sum of the norms. */
+INLINE real units(int rows, int ld, vec *x, const vec *label, int64_t left)
+{
+    real total = 0;
+    vec square[T];
+    for (int t = 0; t < T; ++t) square[t] = (vec){0};
+    for (int r = 0; r < rows; ++r)
+        for (int c = 0; c < C; ++c) {
+            x[r * ld + c] -= label[r * ld + c];
+            square[c % T] += x[r * ld + c] * x[r * ld + c];
+        }
+    for (int t = 0; t < T; ++t)
+        for (int lane = 0; lane < LANES; ++lane) {
+            const real norm = F(sqrt)(square[t][lane]);
+            const int own = t * LANES + lane < left;
+            total += own ? norm : 0;
+            square[t][lane] = own && norm > 0 ? 1 / norm : 0;
+        }
+    for (int r = 0; r < rows; ++r)
+        for (int c = 0; c < C; ++c) x[r * ld + c] *= square[c % T];
+    return total;
+}
+
+/* The Jacobian's part of the gradient, from J (now its adjoint): into g, and into d1_bar, d2_bar for the values' part. */
+static void jacobian_backward(tile *s, const real *w, real *g)
+{
+    outer(H, NZ, C, LD, s->G1, s->J, g);
+    product(H, NZ, w, NZ, 1, C, LD, s->J, s->G1_bar);
+    for (int k = 0; k < H; ++k)
+        for (int t = 0; t < T; ++t) {
+            vec sum = (vec){0};
+            for (int o = 0; o < NX; ++o) {
+                const int c = k * LD + o * T + t;
+                sum += s->G1_bar[c] * s->P[c];
+                s->G1_bar[c] *= s->d1[k * T + t];  /* now the adjoint of P */
+            }
+            s->d1_bar[k * T + t] = sum;
+        }
+    outer(H, H, C, LD, s->G2, s->G1_bar, g + W2);
+    product(H, H, w + W2, H, 1, C, LD, s->G1_bar, s->G2_bar);
+    for (int j = 0; j < H; ++j) {
+        for (int t = 0; t < T; ++t) s->d2_bar[j * T + t] = (vec){0};
+        for (int o = 0; o < NX; ++o) {
+            vec sum = (vec){0};
+            for (int t = 0; t < T; ++t) {
+                const vec bar = s->G2_bar[j * LD + o * T + t];
+                s->d2_bar[j * T + t] += w[W3 + o * H + j] * bar;
+                sum += bar * s->d2[j * T + t];
+            }
+            g[W3 + o * H + j] += sum_of(sum);
+        }
+    }
+}
+
+INLINE void add_sums(int M, const vec *bar, real *g)
+{
+    for (int m = 0; m < M; ++m) {
+        vec sum = (vec){0};
+        for (int t = 0; t < T; ++t) sum += bar[m * T + t];
+        g[m] += sum_of(sum);
+    }
+}
+
+/* The values' part of the gradient, from y (now its adjoint). */
+static void values_backward(tile *s, const real *w, real *g, int with_jacobian)
+{
+    outer(NX, H, T, T, s->y, s->a2, g + W3);
+    add_sums(NX, s->y, g + B3);
+    product(H, NX, w + W3, 1, H, T, T, s->y, s->t2_bar);
+    for (int i = 0; i < H * T; ++i)
+        s->t2_bar[i] = s->t2_bar[i] * s->d2[i] + (with_jacobian ? s->d2_bar[i] * s->e2[i] : (vec){0});
+    outer(H, H, T, T, s->t2_bar, s->a1, g + W2);
+    add_sums(H, s->t2_bar, g + B2);
+    product(H, H, w + W2, 1, H, T, T, s->t2_bar, s->t1_bar);
+    for (int i = 0; i < H * T; ++i)
+        s->t1_bar[i] = s->t1_bar[i] * s->d1[i] + (with_jacobian ? s->d1_bar[i] * s->e1[i] : (vec){0});
+    outer(H, NZ, T, T, s->t1_bar, s->z, g);
+    add_sums(H, s->t1_bar, g + B1);
+}
+
+/* The mean of the loss over rows at[0 .. n - 1] and its gradient g [PARAMETERS]; dfdz NULL: of the values alone.
+   All rows are taken, whatever the blocks; loss is NaN where there is no memory. */
+void nocl_loss(int64_t first_block, int64_t last_block, const int64_t *at, int64_t n, const real *w, const real *z,
+               const real *f, const real *dfdz, real *g, double *loss)
+{
+    (void)first_block, (void)last_block;
+    tile *s = aligned_alloc(BYTES, sizeof(tile));
+    *loss = s ? 0 : NAN;
+    if (!s) return;
+    memset(g, 0, PARAMETERS * sizeof(real));
+    for (int64_t first = 0; first < n; first += T * LANES) {
+        const int64_t left = n - first;
+        load(s, at + first, left, z, f, dfdz);
+        values(s, w);
+        *loss += units(1, C, s->y, s->f, left) / n;
+        if (dfdz) {
+            jacobian(s, w);
+            *loss += units(NZ, LD, s->J, s->dfdz, left) / n;
+            jacobian_backward(s, w, g);
+        }
+        values_backward(s, w, g, dfdz != 0);
+    }
+    for (int i = 0; i < PARAMETERS; ++i) g[i] /= n;
+    free(s);
+}
+
+int64_t nocl_width(void) { return LANES; }
