@@ -8,7 +8,7 @@
 Every tool runs in a process of its own and gets the problem as serialised CasADi functions: f, L, G, h, and RK4's step.
 Cold: x held at x0, u = u*. Warm: a state nearby, from the solution of the first. Every cost is that of the tool's own
 controls, rolled out by the common step. CPU time beside the clock's: the first stands where others use the machine.
-Results go to --out, JSON with command, commit, versions, machine and seeds.
+Results go to --out, JSON, each section with its command, commit, versions, machine and seeds.
 """
 
 from __future__ import annotations
@@ -376,17 +376,25 @@ def environment() -> dict:
             "versions": {p: importlib.metadata.version(p) for p in packages}}
 
 
-def show(result: dict) -> None:
-    for name, part in result.get("tools", {}).items():
-        print(f"\n{name}")
-        columns = ("build s", "cold ms median", "cold ms p95", "warm ms median", "warm ms p95", "warm cpu ms median",
-                   "mean cost", "share at best")
-        print(f"{'':38}" + "".join(f"{c:>19}" for c in columns))
+def show(section: str, result: dict) -> None:
+    if section != "tools":
+        print(f"\n{section}: {json.dumps(result, indent=1)}")
+        return
+    columns = ("build s", "cold ms median", "cold ms p95", "warm ms median", "warm ms p95", "warm cpu ms median",
+               "mean cost", "share at best")
+    for name, part in result.items():
+        print(f"\n{name}\n{'':38}" + "".join(f"{c:>19}" for c in columns))
         for tool, row in part["tools"].items():
             print(f"{tool:38}" + "".join(f"{row[c]:19.4g}" if c in row else f"{'-':>19}" for c in columns))
-    for section in ("share", "parallel"):
-        if section in result:
-            print(f"\n{section}: {json.dumps(result[section], indent=1)}")
+
+
+def write(path: Path, section: str, result: dict, args: argparse.Namespace) -> None:
+    """Put a section into the file of results; the others there stay, each with what it was run by."""
+    settings = {k: v for k, v in vars(args).items() if k in ("states", "many", "intervals", "seed", "workers")}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    there = json.loads(path.read_text()) if path.exists() else {}
+    there[section] = {"environment": environment(), "settings": settings, "results": result}
+    path.write_text(json.dumps(there, indent=1) + "\n")
 
 
 def main() -> None:
@@ -408,18 +416,16 @@ def main() -> None:
     if args.child:
         child(*args.child)
         return
-    result: dict = {"environment": environment(), "settings": {
-        k: v for k, v in vars(args).items() if k in ("states", "many", "intervals", "seed", "problems", "workers")}}
-    for section, run in (("tools", tools), ("share", share)):
-        if section in args.sections:
+    for section in args.sections:
+        if section == "parallel":
+            result = parallel(args)
+        else:
+            result = {}
             for name in args.problems:
                 print(f"{section}: {name}", flush=True)
-                result.setdefault(section, {})[name] = run(args, name)
-    if "parallel" in args.sections:
-        result["parallel"] = parallel(args)
-    show(result)
-    args.out.parent.mkdir(parents=True, exist_ok=True)
-    args.out.write_text(json.dumps(result, indent=1) + "\n")
+                result[name] = (tools if section == "tools" else share)(args, name)
+        show(section, result)
+        write(args.out, section, result, args)
     print(f"\nwritten to {args.out}")
 
 
