@@ -1,4 +1,8 @@
-"""Tasks of NMPC done here, in processes, or on a Dask cluster; outcomes streamed to a folder, for runs that resume."""
+"""Tasks done here, in processes, or on a Dask cluster; outcomes streamed to a folder, for runs that resume.
+
+A task has a name, unique in its run, a size (states), and `outcome(arrays)`, which gives back what an outcome's
+`arrays()` kept; an outcome has name and size. Tasks, outcomes and jobs pickle.
+"""
 
 from __future__ import annotations
 
@@ -15,11 +19,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from nocl.checks import Array
-from nocl.solvers.search import Outcome, Task
-from nocl.solvers.transcription import Answer
-
-CHUNK = 4  # tasks that a worker gets at a time
+Task = Any
+Outcome = Any
+CHUNK = 4  # tasks that a worker gets at a time, at most
 PROBE = 4  # tasks done here first, to measure what one costs
 START = 4.0  # seconds until the processes' first result, beyond building the solver
 WORTH = 4.0  # seconds that processes must save, by measurement
@@ -82,7 +84,9 @@ def _measured(job: Any, tasks: Sequence[Task]) -> Iterator[Outcome]:
 
 
 def _chunks(tasks: Sequence[Task]) -> list[Sequence[Task]]:
-    return [tasks[i: i + CHUNK] for i in range(0, len(tasks), CHUNK)]
+    """CHUNK tasks each; those of many states alone."""
+    n = CHUNK if tasks[0].size == 1 else 1
+    return [tasks[i: i + n] for i in range(0, len(tasks), n)]
 
 
 def _in_processes(k: int, job: Any, tasks: Sequence[Task]) -> Iterator[Outcome]:
@@ -131,6 +135,7 @@ class Journal:
 
     folder: Path | None
     key: str = ""
+    solver: str = "NMPC"
 
     def __post_init__(self) -> None:
         if self.folder is None:
@@ -139,43 +144,34 @@ class Journal:
         if manifest.exists():
             found = json.loads(manifest.read_text())
             if found.get("key") != self.key:
-                raise ValueError(f"{self.folder} holds another run of NMPC (other states, problem, settings or "
-                                 "versions); expected the same one, or a new folder: change `out`")
+                raise ValueError(f"{self.folder} holds another run of nocl (other states, problem, settings or "
+                                 f"versions); expected the same one of {self.solver}, or a new folder: change `out`")
         elif self.folder.exists() and any(self.folder.iterdir()):
-            raise ValueError(f"{self.folder} is not empty and holds no run of NMPC; expected a new folder: change out")
+            raise ValueError(f"{self.folder} is not empty and holds no run of {self.solver}; expected a new folder: "
+                             "change `out`")
         (self.folder / TASKS).mkdir(parents=True, exist_ok=True)
-        _write(manifest, json.dumps({"kind": "nocl NMPC run", "key": self.key}).encode())
+        _write(manifest, json.dumps({"kind": f"nocl {self.solver} run", "key": self.key}).encode())
 
     def file(self, name: str) -> Path:
         assert self.folder is not None
         return self.folder / TASKS / f"{name}.npz"
 
-    def read(self, task: Task) -> Outcome | None:
-        """What was found before, if anything."""
-        if self.folder is None or not self.file(task.name).exists():
-            return None
+    def has(self, task: Task) -> bool:
+        """Whether its outcome was found before."""
+        return self.folder is not None and self.file(task.name).exists()
+
+    def read(self, task: Task) -> Outcome:
+        """What was found before."""
         with np.load(self.file(task.name), allow_pickle=False) as data:
-            arrays = {name: data[name] for name in data.files}
-        return Outcome(task.name, task.row, arrays["costs"], float(arrays["seconds"]), int(arrays["iterations"]),
-                       _answer(arrays, "best"), _answer(arrays, "failed"))
+            return task.outcome({name: data[name] for name in data.files})
 
     def write(self, outcome: Outcome) -> None:
         if self.folder is None:
             return
-        arrays: dict[str, Any] = {"costs": outcome.costs, "seconds": outcome.seconds, "iterations": outcome.iterations}
-        for kind in ("best", "failed"):
-            answer = getattr(outcome, kind)
-            arrays |= {} if answer is None else {f"{kind}.{name}": value for name, value in vars(answer).items()}
         target = self.file(outcome.name)
         part = target.with_name(f".{target.stem}-{os.getpid()}.part.npz")
-        np.savez(part, **arrays)
+        np.savez(part, **outcome.arrays())
         os.replace(part, target)
-
-
-def _answer(arrays: dict[str, Array], kind: str) -> Answer | None:
-    fields: dict[str, Any] = {name.removeprefix(f"{kind}."): value if value.ndim else value.item()
-                              for name, value in arrays.items() if name.startswith(f"{kind}.")}
-    return Answer(**fields) if fields else None
 
 
 def _write(target: Path, content: bytes) -> None:
@@ -184,14 +180,23 @@ def _write(target: Path, content: bytes) -> None:
     os.replace(part, target)
 
 
-def do(job: Any, tasks: Sequence[Task], pool: Pool, journal: Journal, show: bool, what: str) -> list[Outcome]:
-    """The outcomes of all tasks, in their order: those of the journal, the others done now and written at once."""
-    done = {task.name: found for task in tasks if (found := journal.read(task)) is not None}
-    todo = [task for task in tasks if task.name not in done]
-    with tqdm(total=len(tasks), initial=len(done), desc=what, unit="state", delay=3.0, leave=False,
-              disable=not show or len(todo) < 2) as bar:
+def stream(job: Any, tasks: Sequence[Task], pool: Pool, journal: Journal, show: bool, what: str) -> Iterator[Outcome]:
+    """The outcome of each task, in any order: those of the journal first, the others done now and written at once."""
+    todo = [task for task in tasks if not journal.has(task)]
+    left = {task.name for task in todo}
+    total = sum(task.size for task in tasks)
+    with tqdm(total=total, initial=total - sum(task.size for task in todo), desc=what, unit="state", delay=3.0,
+              leave=False, disable=not show or len(todo) < 2) as bar:
+        for task in tasks:
+            if task.name not in left:
+                yield journal.read(task)
         for outcome in pool.outcomes(job, todo):
             journal.write(outcome)
-            done[outcome.name] = outcome
-            bar.update()
+            bar.update(outcome.size)
+            yield outcome
+
+
+def do(job: Any, tasks: Sequence[Task], pool: Pool, journal: Journal, show: bool, what: str) -> list[Outcome]:
+    """The outcomes of all tasks, in their order."""
+    done = {outcome.name: outcome for outcome in stream(job, tasks, pool, journal, show, what)}
     return [done[task.name] for task in tasks]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +29,12 @@ class Task:
     warm: int = 0  # how many of these, the first ones, are solutions of problems nearby
     starts: int = 0
     seed: int = 0
+    size: int = 1  # states
+
+    def outcome(self, arrays: dict[str, Any]) -> Outcome:
+        """What came of this task, from its `arrays()`."""
+        return Outcome(self.name, self.row, arrays["costs"], float(arrays["seconds"]), int(arrays["iterations"]),
+                       _answer(arrays, "best"), _answer(arrays, "failed"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +48,21 @@ class Outcome:
     iterations: int
     best: Answer | None
     failed: Answer | None  # the most feasible of the solves that failed
+    size: int = 1
+
+    def arrays(self) -> dict[str, Any]:
+        """Its fields as plain arrays, for a file."""
+        found: dict[str, Any] = {"costs": self.costs, "seconds": self.seconds, "iterations": self.iterations}
+        for kind in ("best", "failed"):
+            answer = getattr(self, kind)
+            found |= {} if answer is None else {f"{kind}.{name}": value for name, value in vars(answer).items()}
+        return found
+
+
+def _answer(arrays: dict[str, Any], kind: str) -> Answer | None:
+    fields: dict[str, Any] = {name.removeprefix(f"{kind}."): value if value.ndim else value.item()
+                              for name, value in arrays.items() if name.startswith(f"{kind}.")}
+    return Answer(**fields) if fields else None
 
 
 def attempt(program: Transcription, task: Task, guesses: Sequence[Guess]) -> Outcome:
