@@ -44,11 +44,20 @@ def write_report(report: Report, folder: Path) -> Path:
     files[folder / "report.html"] = page(report, svgs, run).encode()
     for path, content in files.items():
         store.write_bytes(path, content)
-    store.write_json(folder / "summary.json", {"verdict": report.verdict(), "summary": list(report.summary()), **run})
+    store.write_json(folder / "summary.json", summary_data(report) | run)
     for name in set(pictures.NAMES) - set(drawn):  # of the report that this one replaces
         for form in ("svg", "png"):
             (folder / "figures" / f"{name}.{form}").unlink(missing_ok=True)
     return folder / "report.html"
+
+
+def summary_data(report: Report) -> dict[str, Any]:
+    """Verdict, summary and what a study found, without arrays over the states, as plain data."""
+    return {"verdict": report.verdict(), "summary": list(report.summary()),
+            "audits": [audit.summary() for audit in report.audits],
+            "robustness": [] if report.robustness is None else report.robustness.summary(),
+            "promises": [vars(promise) | {"text": str(promise)} for promise in report.promises],
+            "stability": [s.summary() for s in report.stability], "regions": [r.summary() for r in report.regions]}
 
 
 def _check_folder(folder: Path) -> None:

@@ -6,7 +6,7 @@ import csv
 import io
 import math
 import textwrap
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -16,17 +16,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nocl.checks import Array
+from nocl.comparisons.findings import MethodAudit, Promise, Region, Robustness, Row, Stability, percentile
 from nocl.ocp import OCP
 from nocl.simulate import Simulation
 
 COST_FLOOR = 1e-8  # gaps are relative to max(|best cost|, this): costs below it are the judge's rounding
 REFERENCE = "reference"  # the name of a yardstick among the methods: its speed is no method's
-UNSTABLE = 0.05  # a plan that costs more than predicted by this share, in the median, is said to lack feedback
 VIOLATION = 1e-3  # a path constraint below minus this, in its own unit, is violated
 OPEN_LOOP = "open loop"  # how a plan's control was run
 WIDTH = 118  # characters of a line in the terminal
-Row = dict[str, Any]
 Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A solver's own trajectory and costate, at the K+1 nodes of its run; NaN where it has none."""
+
+    x: Array  # [B, K+1, nx]
+    costate: Array  # [B, K+1, nx]
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,8 +45,11 @@ class Judged:
     simulation: Simulation
     ms_first: Array  # [B], milliseconds to the first control: a solve, or one evaluation of a controller
     ms_per_control: Array  # [B], milliseconds for each later control; NaN in open loop, where none is computed
+    evaluations: Array  # [B], of f with its derivatives, by which the controls were computed; NaN where unknown
     solves: Array  # [B], solves that `ms_first` went into: several starts, neighbours; 1 for a controller
     predicted: Array  # [B], the cost that the method itself expected, NaN where it has no opinion
+    plan: Plan | None = None  # what a solver planned
+    value: Callable[[Array, float], Array] | None = None  # (x [B, nx], t) -> V [B], where it has one
 
     @property
     def feasible(self) -> Mask:
@@ -58,17 +68,28 @@ class Summary(list[Row]):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Report:
-    """Any methods on the same B initial states of a problem; `rows`, `summary` and `verdict` are read from `judged`."""
+    """Any methods on the same B initial states of a problem; `rows`, `summary` and `verdict` are read from `judged`.
+
+    What a study finds beyond costs stands in the other fields, empty where it was not asked for.
+    """
 
     ocp: OCP
     x0: Array  # [B, nx]
     judged: tuple[Judged, ...]
     settings: Mapping[str, Any]
     seconds: float  # wall time of the comparison
+    audits: tuple[MethodAudit, ...] = ()  # of methods by name: models and integrators, values
+    robustness: Robustness | None = None
+    promises: tuple[Promise, ...] = ()  # one a method, where the states are independent draws
+    stability: tuple[Stability, ...] = ()
+    regions: tuple[Region, ...] = ()
 
     def rows(self) -> list[Row]:
         """One dict a method and initial state; a run that failed has success False, its message, and infinite cost."""
-        return [self._row(m, i) for m in range(len(self.judged)) for i in range(len(self.x0))]
+        audits = {audit.method: audit.rows() for audit in self.audits}
+        keys = list(dict.fromkeys(key for rows in audits.values() for key in rows[0]))
+        return [self._row(m, i) | dict.fromkeys(keys, math.nan) | (audits[j.name][i] if j.name in audits else {})
+                for m, j in enumerate(self.judged) for i in range(len(self.x0))]
 
     def summary(self) -> Summary:
         """One dict a method. Means are over the runs that did not fail; medians, percentiles and shares over all."""
@@ -76,6 +97,8 @@ class Report:
 
     def verdict(self) -> list[str]:
         """What the numbers say, in a few sentences."""
+        from nocl.comparisons.verdict import verdict
+
         return verdict(self)
 
     @cached_property
@@ -117,28 +140,29 @@ class Report:
                 "gap": float(self.gap[m, i]), "best_cost": float(self.best[i]), "best_method": self.best_method[i],
                 "predicted_cost": float(j.predicted[i]), "running_cost": float(s.running_cost[i]),
                 "terminal_cost": float(s.terminal_cost[i]), "terminal_error": float(s.terminal_error[i]),
-                "x_end": s.x[i, -1].tolist(), "control_magnitude": float(s.control_magnitude[i]),
+                "x_end": s.x[i, -1].tolist(), "error": (s.x[i, -1] - self.ocp.x_goal).tolist(),
+                "control_magnitude": float(s.control_magnitude[i]),
                 "saturation": float(s.saturation[i]), "clearance": float(s.clearance[i]),
                 "ms_first": float(j.ms_first[i]), "solves": int(j.solves[i]),
-                "ms_per_control": float(j.ms_per_control[i])}
+                "ms_per_control": float(j.ms_per_control[i]), "evaluations": float(j.evaluations[i])}
 
     def _summarize(self, m: int) -> Row:
         j, s, gap = self.judged[m], self.judged[m].simulation, self.gap[m]
         ok = np.asarray(s.success, dtype=bool)
         return {"method": j.name, "how": j.how, "n": len(self.x0), "failures": int((~ok).sum()),
                 "violations": int((ok & ~self.feasible[m]).sum()),
-                "cost_mean": _mean(s.cost[ok]), "cost_median": float(np.median(s.cost)),
-                "predicted_mean": _mean(j.predicted[ok]),
+                "cost_mean": mean(s.cost[ok]), "cost_median": float(np.median(s.cost)),
+                "predicted_mean": mean(j.predicted[ok]),
                 "gap_median": percentile(gap, 50), "gap_p95": percentile(gap, 95),
                 "within_1": 100 * float(self.within(1).mean(axis=1)[m]),
                 "within_5": 100 * float(self.within(5).mean(axis=1)[m]),
                 "found_best": self.best_method.count(j.name),
-                "terminal_error_mean": _mean(s.terminal_error[ok]),
+                "terminal_error_mean": mean(s.terminal_error[ok]),
                 "terminal_error_sd": float(s.terminal_error[ok].std()) if ok.any() else math.nan,
-                "control_magnitude": _mean(s.control_magnitude[ok]), "saturation": _mean(s.saturation[ok]),
+                "control_magnitude": mean(s.control_magnitude[ok]), "saturation": mean(s.saturation[ok]),
                 "clearance_min": float(np.min(s.clearance[ok], initial=math.inf)),
-                "ms_first": _mean(j.ms_first), "solves": _mean(j.solves), "ms_per_solve": _mean(_each_answer(j)),
-                "ms_per_control": _mean(j.ms_per_control)}
+                "ms_first": mean(j.ms_first), "solves": mean(j.solves), "ms_per_solve": mean(_each_answer(j)),
+                "ms_per_control": mean(j.ms_per_control)}
 
     def save(self, folder: str | Path) -> Path:
         """Write report.html, rows.csv, summary.json and figures/ into the folder, and return the path of report.html.
@@ -163,14 +187,10 @@ def _each_answer(judged: Judged) -> Array:
     return np.where(feedback, judged.ms_per_control, judged.ms_first / judged.solves)
 
 
-def _mean(values: Array) -> float:
+def mean(values: Array) -> float:
+    """Of what is no NaN; NaN of nothing."""
     known = values[~np.isnan(values)]
     return float(known.mean()) if known.size else math.nan
-
-
-def percentile(values: Array, q: float) -> float:
-    """The q-th percentile; where some are inf (failures) the nearest value above, since inf cannot be interpolated."""
-    return float(np.percentile(values, q, method="linear" if np.isfinite(values).all() else "higher"))
 
 
 # label, key(s) that the cell is made of, how it is written
@@ -229,91 +249,19 @@ def text_table(head: Sequence[str], body: Iterable[Sequence[str]]) -> str:
     return "\n".join([text[0], "  ".join("-" * w for w in widths), *text[1:]])
 
 
-def verdict(report: Report) -> list[str]:
-    """Who is how near to the best known cost; how fast; what failed."""
-    summary = report.summary()
-    n = len(report.x0)
-    open_loop = [said for j in report.judged for said in _without_feedback(j)]
-    return [_near(report, summary), *_manners(summary), *open_loop, *_speed(summary), *_failures(summary, n)]
-
-
-def _near(report: Report, summary: Sequence[Row]) -> str:
-    """Who is within 5 % of the best known cost; a method with all the answers is the best known by itself."""
-    n, answers = len(report.x0), report.feasible.sum(axis=1)
-    if np.count_nonzero(answers) == 1:
-        m = int(answers.argmax())
-        return (f"Only {summary[m]['method']} has answers that count, on {_share(100 * answers[m] / n, n)} initial "
-                "states: there is nothing to compare its cost with.")
-    near = [f"{row['method']} on {_share(row['within_5'], n)}{_gap_text(row)}" for row in summary]
-    return f"Within 5 % of the best known cost of {count(n, 'initial state')}: " + ", ".join(near) + "."
-
-
-def _without_feedback(judged: Judged) -> list[str]:
-    """Plans that cost more than they predict, in the median: without feedback errors grow, most where f is unstable."""
-    known = np.asarray(judged.simulation.success, dtype=bool) & np.isfinite(judged.predicted)
-    cost, predicted = judged.simulation.cost[known], judged.predicted[known]
-    excess = (cost - predicted) / np.maximum(np.abs(predicted), COST_FLOOR)
-    if not judged.how.startswith(OPEN_LOOP) or not known.any() or np.median(excess) <= UNSTABLE:
-        return []
-    return [f"{judged.name}'s plans predict a cost of {number(_mean(predicted))} on average; run open loop on the "
-            f"exact f they cost {number(_mean(cost))}: what is missing there is feedback, or a finer grid or model, "
-            "not optimality."]
-
-
-def _manners(summary: Sequence[Row]) -> list[str]:
-    """How each control was run, where they differ: holding a control costs something by itself."""
-    if len({row["how"] for row in summary}) < 2:
-        return []
-    return ["How they were run: " + "; ".join(f"{row['method']}: {row['how']}" for row in summary)
-            + ". Holding a control costs something by itself."]
-
-
-def _gap_text(row: Row) -> str:
-    return f" (median gap {percent(row['gap_median'])} %)" if math.isfinite(row["gap_median"]) else ""
-
-
-def _share(percent_of_n: float, n: int) -> str:
-    k = round(percent_of_n * n / 100)
-    return f"all {n}" if k == n > 1 else f"{k} of {n}"
-
-
 def count(k: int, what: str) -> str:
     """Like '1 interval' or '2 intervals'."""
     return f"{k} {what}" + ("" if k == 1 else "s")
 
 
-def _speed(summary: Sequence[Row]) -> list[str]:
-    """The fastest and the slowest of the useful methods; CND and NMPC, where both are there."""
-    useful = [row for row in summary if row["within_5"] > 0 and row["ms_per_solve"] > 0 and row["method"] != REFERENCE]
-    pair = [row for row in useful if row["method"] in ("CND", "NMPC")]
-    timed = sorted(pair if len(pair) == 2 else useful, key=lambda row: row["ms_per_solve"])
-    if len(timed) < 2:
-        return []
-    fast, slow = timed[0], timed[-1]
-    ratio = slow["ms_per_solve"] / fast["ms_per_solve"]
-    if ratio < 1.5:
-        return [f"{fast['method']} and {slow['method']} answer about equally fast."]
-    times = f"{float(f'{ratio:.2g}'):,.0f}" if ratio >= 10 else f"{ratio:.1f}"
-    return [f"{fast['method']} has its control in {number(fast['ms_per_solve'])} ms, {slow['method']} in "
-            f"{number(slow['ms_per_solve'])} ms: {times} times faster."]
-
-
-def _failures(summary: Sequence[Row], n: int) -> list[str]:
-    parts = [f"{row['method']} failed on {row['failures']} of {n}" for row in summary if row["failures"]]
-    parts += [f"{row['method']} violates a path constraint on {row['violations']} of {n}" for row in summary
-              if row["violations"]]
-    return ["; ".join(parts) + "."] if parts else ["No run failed, and no path constraint was violated."
-                                                   if math.isfinite(summary[0]["clearance_min"]) else "No run failed."]
-
-
 def flat_rows(report: Report) -> list[Row]:
-    """The rows with one column a coordinate: x0 as x0_NAME, x_end as end_NAME."""
+    """The rows with one column a coordinate: x0 as x0_NAME, x_end as end_NAME, x_end - x* as error_NAME."""
     names = report.ocp.system.state_names
     flat = []
     for row in report.rows():
-        x0, end = row.pop("x0"), row.pop("x_end")
-        flat.append(row | {f"x0_{name}": v for name, v in zip(names, x0, strict=True)}
-                    | {f"end_{name}": v for name, v in zip(names, end, strict=True)})
+        for key, short in (("x0", "x0"), ("x_end", "end"), ("error", "error")):
+            row |= {f"{short}_{name}": v for name, v in zip(names, row.pop(key), strict=True)}
+        flat.append(row)
     return flat
 
 

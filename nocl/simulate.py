@@ -101,9 +101,12 @@ def dynamics_function(ocp: OCP, f: Any) -> ca.Function:
 
 
 def policy_function(ocp: OCP, controller: Any) -> ca.Function | None:
-    """The policy (x, t) -> u as a casadi.Function, or None where the controller has none."""
+    """The policy (x, t) -> u as a casadi.Function, or None where the controller has none; one of x alone gets a t."""
     s = ocp.system
     g = controller if isinstance(controller, ca.Function) else _converted(controller)
+    if g is not None and [g.numel_in(i) for i in range(g.n_in())] == [s.nx]:
+        x, t = ca.MX.sym("x", s.nx), ca.MX.sym("t")
+        g = ca.Function(g.name(), [x, t], [g(x if g.size2_in(0) == 1 else x.T)], ["x", "t"], ["u"])
     return g if g is None else _with_sizes(g, (s.nx, 1), s.nu, "the policy", "(x, t) -> u", s.name)
 
 

@@ -10,7 +10,7 @@ import nocl
 from nocl.comparisons import compare
 from nocl.comparisons.report import percentile
 from nocl.data import Solution, Trajectory
-from nocl.solvers import LQR, NMPC
+from nocl.solvers import DDP, LQR, NMPC
 from nocl.systems import double_integrator, dubins
 
 N = 6
@@ -216,6 +216,80 @@ def test_nmpc_in_closed_loop_is_sampled_at_its_own_rate(ocp):
     assert report.summary()[0]["failures"] == 0
 
 
+def test_each_controller_is_run_at_the_rates_that_are_named(ocp):
+    loop = NMPC(ocp, intervals=10, starts=1, passes=0).controller()
+    report = compare(ocp, {"LQR": LQR(ocp), "loop": loop, "mine": nothing}, n=2, hold=[None, 20, 40], progress=False)
+    assert [row["method"] for row in report.summary()] == \
+        ["LQR", "LQR (20 holds)", "LQR (40 holds)", "loop (20 holds)", "loop (40 holds)", "mine (20 holds)",
+         "mine (40 holds)"]
+    cost = dict(zip([j.name for j in report.judged], report.cost[:, 0], strict=True))
+    assert cost["LQR"] < cost["loop (40 holds)"] < cost["loop (20 holds)"] < 1.05 * cost["LQR"]
+    assert cost["LQR (40 holds)"] < cost["LQR (20 holds)"]
+    row = next(row for row in report.rows() if row["method"] == "loop (40 holds)")
+    assert row["ms_first"] > 0 < row["ms_per_control"]
+    assert row["evaluations"] >= 40 * 10 * 4
+
+
+def test_an_imported_onnx_policy_is_a_method(ocp, tmp_path):
+    onnx = pytest.importorskip("onnx")
+    from nocl.from_onnx import from_onnx
+
+    W = onnx.numpy_helper.from_array(np.array([[-1.0], [-2.0]]), "W")
+    obs, u = (onnx.helper.make_tensor_value_info(name, onnx.TensorProto.DOUBLE, [1, n]) for name, n in (("obs", 2),
+                                                                                                    ("u", 1)))
+    graph = onnx.helper.make_graph([onnx.helper.make_node("MatMul", ["obs", "W"], ["u"])], "policy", [obs], [u], [W])
+    path = tmp_path / "policy.onnx"
+    onnx.save(onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=8), path)
+    gain = lambda x, t: x @ np.array([[-1.0], [-2.0]])  # noqa: E731
+    report = compare(ocp, {"ONNX": from_onnx(path), "by hand": gain}, n=2, hold=[30], progress=False)
+    np.testing.assert_allclose(report.cost[0], report.cost[1], rtol=1e-9)
+
+
+def test_ddp_counts_what_it_evaluated(ocp):
+    report = compare(ocp, {"DDP": DDP(ocp, intervals=20), "LQR": LQR(ocp)}, n=2, progress=False)
+    assert report.judged[0].evaluations.min() >= 20 * 4
+    assert (report.judged[1].evaluations == 0).all()
+    plan = report.judged[0].plan
+    np.testing.assert_allclose(plan.x, report.judged[0].simulation.x, atol=1e-6)
+    assert plan.costate.shape == plan.x.shape
+
+
+def test_processes_find_the_same(ocp):
+    methods = {"LQR": LQR(ocp), "NMPC": NMPC(ocp, intervals=10, starts=1, passes=0), "mine": lambda x, t: -x[:, :1]}
+    here, there = (compare(ocp, methods, n=4, workers=workers, progress=False) for workers in (1, 2))
+    np.testing.assert_array_equal(here.cost, there.cost)
+    assert [j.how for j in here.judged] == [j.how for j in there.judged]
+
+
+class Counting:
+    """A controller that counts its calls."""
+
+    calls = 0
+
+    def __call__(self, x, t):
+        Counting.calls += 1
+        if t > 1.0 and Counting.calls < 50:
+            Counting.calls = 50
+            raise KeyboardInterrupt
+        return -x[:, :1]
+
+
+def test_a_comparison_resumes_where_it_was_interrupted(ocp, tmp_path):
+    methods = {"LQR": LQR(ocp), "NMPC": NMPC(ocp, intervals=10, starts=1, passes=0), "mine": Counting()}
+    with pytest.raises(KeyboardInterrupt):
+        compare(ocp, methods, n=3, hold=20, out=tmp_path, progress=False)
+    whole = compare(ocp, methods, n=3, hold=20, out=tmp_path, progress=False)
+    calls = Counting.calls
+    again = compare(ocp, methods, n=3, hold=20, out=tmp_path, progress=False)
+    assert Counting.calls == calls
+    for a, b in zip(whole.judged, again.judged, strict=True):
+        np.testing.assert_array_equal(a.simulation.x, b.simulation.x)
+        assert list(a.simulation.message) == list(b.simulation.message)
+        np.testing.assert_array_equal(a.ms_first, b.ms_first)
+    with pytest.raises(ValueError, match="another run"):
+        compare(ocp, methods, n=4, hold=20, out=tmp_path, progress=False)
+
+
 def test_casadi_functions_are_methods(ocp):
     x, t = ca.MX.sym("x", 2), ca.MX.sym("t")
     policy = ca.Function("policy", [x, t], [-x[0] - x[1]])
@@ -232,6 +306,10 @@ def test_casadi_functions_are_methods(ocp):
     ({"a": nothing}, {"n": 0}, "n is 0"),
     ({"a": nothing}, {"n": 2.5}, "n is 2.5"),
     ({"a": nothing}, {"hold": 0}, "hold is 0"),
+    ({"a": nothing}, {"hold": []}, "hold is"),
+    ({"a": nothing}, {"hold": [None, 2.5]}, "hold is"),
+    ({"a": nothing}, {"hold": "80"}, "hold is"),
+    ({"a": nothing}, {"workers": 0}, "workers is 0"),
     ({"a": nothing}, {"x0": [[1.0, 2.0, 3.0]]}, "nx = 2"),
     ({"a": nothing}, {"x0": np.zeros((0, 2))}, "no rows"),
     ({"a": nothing}, {"x0": [np.nan, 0.0]}, "finite"),

@@ -89,7 +89,7 @@ def test_rows_come_back_from_csv_bit_by_bit(report, folder):
     for line, row in zip(table, rows, strict=True):
         for key, value in row.items():
             if isinstance(value, list):
-                prefix = {"x0": "x0", "x_end": "end"}[key]
+                prefix = {"x0": "x0", "x_end": "end", "error": "error"}[key]
                 np.testing.assert_array_equal([float(line[f"{prefix}_{name}"]) for name in "pv"], value)
             elif isinstance(value, (bool, str)):
                 assert line[key] == str(value)

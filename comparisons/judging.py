@@ -1,0 +1,266 @@
+"""Runs under the judge, in parts that processes share, with or without disturbances. B is the batch."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from nocl.checks import Array
+from nocl.comparisons.methods import STAGES, Run, said
+from nocl.ocp import OCP
+from nocl.simulate import Simulation, simulate
+from nocl.solvers.compiled import fingerprint
+from nocl.solvers.loop import Loop
+from nocl.solvers.pool import Journal, Pool, do
+
+CALLS = 20  # control evaluations that are timed at each initial state, at most; the median counts
+TIMED = 100.0  # milliseconds spent on that, about
+Rows = NDArray[np.int64]
+PARTS = 20  # that the states of a run are judged in
+
+
+@dataclass(frozen=True, eq=False)
+class Disturbance:
+    """What befalls all runs alike; the default is nothing."""
+
+    f: ca.Function | None = None  # another plant than the exact one
+    kicks: tuple[tuple[float, Array], ...] = ()  # (time, dx [B, nx])
+    noise: Array | None = None  # [nx], standard deviation of what a controller reads of each state
+    seed: int = 0  # of the noise
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """B states of a run, judged."""
+
+    simulation: Simulation
+    ms_first: Array  # [B]
+    ms_per_control: Array  # [B]
+    evaluations: Array  # [B]
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """Some states of one run; a task of nocl.solvers.pool."""
+
+    name: str
+    run: int
+    rows: Rows  # [size]
+
+    @property
+    def size(self) -> int:
+        return len(self.rows)
+
+    def outcome(self, arrays: Mapping[str, Array]) -> JudgedPart:
+        """What JudgedPart.arrays() kept."""
+        values: dict[str, Any] = dict(arrays)
+        times = [values.pop(f.name) for f in fields(Judgement) if f.name != "simulation"]
+        values["message"] = [str(m) for m in values["message"]]
+        return JudgedPart(self.name, self.size, Judgement(Simulation(**values), *times))
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedPart:
+    """The outcome of a Part."""
+
+    name: str
+    size: int
+    judgement: Judgement
+
+    def arrays(self) -> dict[str, Array]:
+        s, j = self.judgement.simulation, self.judgement
+        return {f.name: np.asarray(getattr(s, f.name)) for f in fields(Simulation)} | \
+            {f.name: getattr(j, f.name) for f in fields(Judgement) if f.name != "simulation"}
+
+
+@dataclass(frozen=True, eq=False)
+class Judging:
+    """Does Parts; `delays` [runs] is the time from a sample to its control."""
+
+    ocp: OCP
+    x0: Array
+    runs: Sequence[Run]
+    disturbance: Disturbance
+    delays: Sequence[float]
+    timed: bool = True
+
+    def build(self) -> None:
+        """Nothing is shared by the parts."""
+
+    def __call__(self, part: Part) -> JudgedPart:
+        run, delay = self.runs[part.run], self.delays[part.run]
+        return JudgedPart(part.name, part.size, self.judge(run, part.rows, delay))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """By cloudpickle, so that users' functions reach processes too."""
+        import cloudpickle
+
+        slim = [replace(run, method=None, solved=None if run.solved is None else
+                        replace(run.solved, plan=None)) for run in self.runs]  # type: ignore[arg-type]
+        return _unpickled, (cloudpickle.dumps((self.ocp, self.x0, slim, self.disturbance, self.delays, self.timed)),)
+
+    def judge(self, run: Run, rows: Rows, delay: float) -> Judgement:
+        if run.solved is not None:
+            return self._plan(run, rows)
+        try:
+            return self._feedback(run, rows, delay)
+        except Exception as error:  # whatever a user's controller raises becomes a row: the other states go on
+            if len(rows) > 1:
+                return joined(self.ocp, [self.judge(run, row[None], delay) for row in rows])
+            return _unknown(failed(self.ocp, [said(error)], self._nodes(run.hold or 80)))
+
+    def _nodes(self, K: int) -> Array:
+        return np.linspace(0.0, self.ocp.horizon, K + 1)
+
+    def _feedback(self, run: Run, rows: Rows, delay: float) -> Judgement:
+        x0, controller, d = self.x0[rows], run.controller, self.disturbance
+        if d.noise is not None and run.hold is not None:
+            controller = _Noisy(controller, self.ocp.horizon, run.hold, _noise(d, rows, run.hold))
+        s = simulate(self.ocp, controller, x0, f=d.f, hold=run.hold, delay=delay,
+                     kicks=[(t, dx[rows]) for t, dx in d.kicks])
+        if isinstance(run.controller, Loop):
+            return Judgement(s, *_of_loop(run.controller))
+        if not self.timed:
+            return _unknown(s)
+        first, median = np.array([_milliseconds(run.controller, x) for x in x0]).T
+        free = isinstance(run.controller, ca.Function)
+        return Judgement(s, first, median, np.full(len(rows), 0.0 if free else np.nan))
+
+    def _plan(self, run: Run, rows: Rows) -> Judgement:
+        """Controls in open loop; states without controls keep the solver's message."""
+        assert run.solved is not None
+        message = [run.solved.message[i] for i in rows]
+        ok = np.array([not m for m in message])
+        s, d = failed(self.ocp, message, self._nodes(run.controller.shape[1])), self.disturbance
+        if ok.any():
+            kicks = [(t, dx[rows[ok]]) for t, dx in d.kicks]
+            s = _put(s, simulate(self.ocp, run.controller[rows[ok]], self.x0[rows[ok]], f=d.f, kicks=kicks), ok)
+        return Judgement(s, run.solved.ms[rows], np.full(len(rows), np.nan), run.solved.evaluations[rows])
+
+
+def _unpickled(data: bytes) -> Judging:
+    import cloudpickle
+
+    return Judging(*cloudpickle.loads(data))
+
+
+def judge(job: Judging, workers: int | str, out: Path | None, progress: bool | None, what: str) -> list[Judgement]:
+    """All runs of a job on all its states; with `out` what is there already is taken from there."""
+    B = len(job.x0)
+    rows = np.array_split(np.arange(B), min(B, PARTS))
+    parts = [Part(f"run-{m}-{i:02d}", m, part) for i, part in enumerate(rows) for m in range(len(job.runs))]
+    journal = Journal(out, _key(job) if out is not None else "", "a comparison")
+    show = sys.stderr.isatty() if progress is None else progress
+    done = do(job, parts, Pool(_possible(job, workers)), journal, show, what)
+    return [joined(job.ocp, [outcome.judgement for part, outcome in zip(parts, done, strict=True) if part.run == m])
+            for m in range(len(job.runs))]
+
+
+def _possible(job: Judging, workers: int | str) -> int | str:
+    """`workers`, or 1 for "auto" where a method cannot go to other processes."""
+    if workers == 1:
+        return 1
+    try:
+        job.__reduce__()
+    except Exception as error:  # pickling raises whatever an object raises
+        if workers == "auto":
+            return 1
+        raise ValueError(f"a method cannot be sent to other processes ({said(error)}): use workers=1") from error
+    return workers
+
+
+def _key(job: Judging) -> str:
+    """A fingerprint of all that outcomes depend on; plain callables are known by name."""
+    d = job.disturbance
+    arrays = [part for run in job.runs for part in run.identity] + [a for kick in d.kicks for a in kick]
+    return fingerprint(json.dumps(job.ocp.to_data(), sort_keys=True), job.x0, *arrays, list(job.delays), d.seed,
+                       "" if d.f is None else d.f.serialize(), "" if d.noise is None else d.noise, version("nocl"),
+                       version("casadi"))
+
+
+class _Noisy:
+    """A controller that reads x + noise; sampled, so that each sample has its own noise."""
+
+    def __init__(self, controller: Any, horizon: float, hold: int, noise: Array) -> None:
+        self.controller, self.step, self.noise = controller, horizon / hold, noise
+
+    def __call__(self, x: Array, t: float) -> Array:
+        seen = x + self.noise[:, round(t / self.step)]
+        if isinstance(self.controller, ca.Function):
+            return np.asarray(self.controller(seen.T, t).full().T)
+        return np.asarray(self.controller(seen, t))
+
+
+def _noise(d: Disturbance, rows: Rows, K: int) -> Array:
+    """[B, K, nx]; a state's noise does not depend on which others are run with it."""
+    assert d.noise is not None
+    return np.array([d.noise * np.random.default_rng([d.seed, int(i)]).standard_normal((K, len(d.noise)))
+                     for i in rows])
+
+
+def _of_loop(loop: Loop) -> tuple[Array, Array, Array]:
+    """(ms of the first solve, the median of the later ones, evaluations of f by all), from the loop's last run."""
+    ms = 1e3 * np.array([step["seconds"] for step in loop.stats])
+    iterations = np.sum([step["iterations"] for step in loop.stats], axis=0)
+    nmpc = loop.nmpc
+    return ms[0], np.median(ms[1:] if len(ms) > 1 else ms, axis=0), iterations * nmpc.intervals * STAGES * nmpc.substeps
+
+
+def _milliseconds(controller: Any, x: Array) -> tuple[float, float]:
+    """(first, median) time of a control evaluation at (x, 0): the first differs where a controller warm-starts."""
+    argument = x if isinstance(controller, ca.Function) else x[None]
+    times: list[float] = []
+    try:
+        while len(times) < CALLS and sum(times) < TIMED:
+            start = time.perf_counter()
+            controller(argument, 0.0)
+            times.append(1e3 * (time.perf_counter() - start))
+    except Exception:  # whatever a user's controller raises: the judge has its message
+        return np.nan, np.nan
+    median = float(np.median(times[1:] or times))
+    return (median if isinstance(controller, ca.Function) else times[0]), median
+
+
+def _unknown(s: Simulation) -> Judgement:
+    return Judgement(s, *np.full((3, len(s.cost)), np.nan))
+
+
+def failed(ocp: OCP, message: Sequence[str], t: Array) -> Simulation:
+    """What the judge says of states that there was nothing to run on."""
+    B, K = len(message), len(t)
+    inf, nan = np.full((4, B), np.inf), np.full((3, B), np.nan)
+    x, u = (np.full((B, K, n), np.nan) for n in (ocp.system.nx, ocp.system.nu))
+    return Simulation(t, x, u, inf[0], inf[1], inf[2], inf[3], nan[0], nan[1], nan[2], np.zeros(B, dtype=bool),
+                      list(message))
+
+
+def joined(ocp: OCP, parts: Sequence[Judgement]) -> Judgement:
+    """Several batches of one run as one; a part that never ran takes over the grid of those that did."""
+    t = max((part.simulation.t for part in parts), key=len)
+    runs = [p.simulation if len(p.simulation.t) == len(t) else failed(ocp, p.simulation.message, t) for p in parts]
+    values = {f.name: np.concatenate([getattr(run, f.name) for run in runs]) for f in fields(Simulation)
+              if f.name not in ("t", "message")}
+    simulation = Simulation(t=t, message=[m for run in runs for m in run.message], **values)
+    return Judgement(simulation, *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Judgement)
+                                   if f.name != "simulation"))
+
+
+def _put(simulation: Simulation, part: Simulation, where: Array) -> Simulation:
+    """`simulation` with the rows `where` taken from `part`."""
+    message = list(simulation.message)
+    for i, why in zip(np.flatnonzero(where), part.message, strict=True):
+        message[i] = why
+    for f in fields(Simulation):
+        if f.name not in ("t", "message"):
+            getattr(simulation, f.name)[where] = getattr(part, f.name)
+    return replace(simulation, message=message)

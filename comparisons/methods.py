@@ -1,0 +1,253 @@
+"""What a method is, and the runs that it is judged by. B is the batch, K the intervals.
+
+- feedback (a casadi.Function (x, t) -> u, or an object with `to_casadi()`, as CND and LQR): at each of the rates asked
+  for, None meaning continuously;
+- a solver (an object with `solve(x0)`, as NMPC and DDP) or its Solution: open loop, its controls held on its own grid;
+- NMPC's closed loop, and any other callable (x [B, nx], t) -> u [B, nu]: sampled and held, at the rates asked for, else
+  at its own, else SAMPLED.
+"""
+
+from __future__ import annotations
+
+import inspect
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from nocl.checks import Array
+from nocl.comparisons.report import OPEN_LOOP, Plan, count
+from nocl.data import Solution
+from nocl.ocp import OCP
+from nocl.simulate import policy_function
+from nocl.solvers.loop import Loop
+
+SAMPLED = 80  # intervals that a plain callable is held on
+STAGES = 4  # evaluations of f in an RK4 step
+Rates = tuple[int | None, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """One method at one rate."""
+
+    name: str
+    how: str
+    method: Any  # as it was given
+    controller: Any  # what the judge runs: a casadi.Function, a callable, or controls [B, K, nu], NaN where unsolved
+    hold: int | None = None
+    solved: Solved | None = None
+
+    @property
+    def identity(self) -> Any:
+        """What outcomes depend on; of a plain callable its name alone is known."""
+        if isinstance(self.controller, ca.Function):
+            what: Any = self.controller.serialize()
+        elif isinstance(self.controller, Loop):
+            what = f"{self.controller.nmpc.key} {self.controller.receding}"
+        elif isinstance(self.controller, np.ndarray):
+            what = self.controller
+        else:
+            what = getattr(self.controller, "__qualname__", type(self.controller).__qualname__)
+        return [self.name, self.hold, what]
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """What solvers said of B states."""
+
+    ms: Array  # [B]
+    solves: Array  # [B]
+    predicted: Array  # [B]
+    evaluations: Array  # [B]
+    plan: Plan
+    message: list[str]  # [B], "" or why there is nothing to judge
+
+
+@dataclass(frozen=True)
+class Solving:
+    """How solvers are called."""
+
+    workers: int | str = 1
+    out: Path | None = None
+    progress: bool | None = None
+
+
+def checked(methods: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Methods by name, or ValueError."""
+    if not isinstance(methods, Mapping) or not methods:
+        raise ValueError(f"methods is {type(methods).__name__} {methods!r}; expected a dict of methods by name, "
+                         'like {"CND": cnd, "NMPC": nmpc}')
+    for name in methods:
+        if not isinstance(name, str) or not name.strip() or not name.isprintable():
+            raise ValueError(f"a method is named {name!r}; expected a printable name")
+    return methods
+
+
+def rates_of(hold: int | Sequence[int | None] | None) -> Rates:
+    """None: continuous. K: continuous, and held on K intervals. A list: these, None standing for continuous."""
+    given = (None,) if hold is None else (None, hold) if isinstance(hold, (int, np.integer)) else hold
+    if isinstance(given, str) or not isinstance(given, Sequence) or not given or \
+            not all(rate is None or is_count(rate) for rate in given):
+        raise ValueError(f"hold is {hold!r}; expected a number of intervals >= 1, None for continuous feedback, or a "
+                         "list of these")
+    return tuple(dict.fromkeys(None if rate is None else int(rate) for rate in given))
+
+
+def is_count(value: Any) -> bool:
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(value >= 1)
+
+
+def runs_of(ocp: OCP, methods: Mapping[str, Any], x0: Array, rates: Rates, solving: Solving) -> list[Run]:
+    """The runs of all methods, in order; ValueError for what is no method, before anything is solved."""
+    for name, method in methods.items():
+        _check(ocp, name, method, x0)
+    names = [run for name, method in methods.items() for run in _names(ocp, name, method, rates)]
+    if len(set(names)) < len(names):
+        raise ValueError(f"the methods are named {', '.join(names)}; expected different names: rename one")
+    return [run for name, method in methods.items() for run in _runs(ocp, name, method, x0, rates, solving)]
+
+
+def _check(ocp: OCP, name: str, method: Any, x0: Array) -> None:
+    if isinstance(method, Solution):
+        _check_solution(ocp, name, method, x0)
+    elif _policy(ocp, name, method) is None and not hasattr(method, "solve") and not callable(method):
+        raise ValueError(f"method {name!r} is a {type(method).__name__}; expected a controller with to_casadi(), a "
+                         "casadi.Function (x, t) -> u, a solver with solve(x0), a Solution, or a callable (x, t) -> u")
+
+
+def _is_plan(method: Any) -> bool:
+    """Whether it is run open loop."""
+    return isinstance(method, Solution) or \
+        (hasattr(method, "solve") and not hasattr(method, "to_casadi") and not isinstance(method, ca.Function))
+
+
+def _names(ocp: OCP, name: str, method: Any, rates: Rates) -> list[str]:
+    if _is_plan(method):
+        return [name]
+    if _policy(ocp, name, method) is not None:
+        return [_held_name(name, rate) for rate in rates]
+    held = _sampled(method, rates)
+    return [name] if len(held) == 1 else [_held_name(name, rate) for rate in held]
+
+
+def _held_name(name: str, rate: int | None) -> str:
+    return name if rate is None else f"{name} ({count(rate, 'hold')})"
+
+
+def _runs(ocp: OCP, name: str, method: Any, x0: Array, rates: Rates, solving: Solving) -> list[Run]:
+    names = _names(ocp, name, method, rates)
+    if _is_plan(method):
+        parts = [(method, np.nan)] if isinstance(method, Solution) else solve(method, name, x0, solving)
+        return [planned(ocp, name, method, parts, len(x0))]
+    policy = _policy(ocp, name, method)
+    if policy is not None:
+        return [Run(n, how(rate), method, policy, rate) for n, rate in zip(names, rates, strict=True)]
+    return [Run(n, how(rate), method, at_rate(method, rate), rate)
+            for n, rate in zip(names, _sampled(method, rates), strict=True)]
+
+
+def how(hold: int | None, delay: float = 0.0) -> str:
+    """How feedback was run, in words."""
+    text = "continuous feedback" if hold is None else f"feedback, held on {count(hold, 'interval')}"
+    return text + (f", {1e3 * delay:.3g} ms late" if delay else "")
+
+
+def at_rate(method: Any, hold: int) -> Any:
+    """NMPC's loop plans for the rate that it is run at; other callables need not know it."""
+    return Loop(method.nmpc, hold, method.receding) if isinstance(method, Loop) else method
+
+
+def _sampled(method: Any, rates: Rates) -> list[int]:
+    """Intervals for sampled feedback: as asked for, the method's own (NMPC's loop has a `hold`), or SAMPLED."""
+    own = getattr(method, "hold", None)
+    return [rate for rate in rates if rate is not None] or [int(own) if is_count(own) else SAMPLED]  # type: ignore[arg-type]
+
+
+def _policy(ocp: OCP, name: str, method: Any) -> ca.Function | None:
+    try:
+        return policy_function(ocp, method)
+    except ValueError as error:
+        raise ValueError(f"method {name!r}: {error}") from error
+
+
+def _check_solution(ocp: OCP, name: str, solution: Solution, x0: Array) -> None:
+    B = len(x0)
+    if solution.u.ndim != 3 or len(solution.u) != B or solution.u.shape[2] != ocp.system.nu:
+        raise ValueError(f"method {name!r} is a Solution with controls {solution.u.shape}; expected [{B}, K, "
+                         f"{ocp.system.nu}], one solution for each of the {B} initial states: pass its x0 to compare")
+    same = np.isclose(solution.x[:, 0], x0, rtol=1e-6, atol=1e-6).all(axis=1)
+    away = np.flatnonzero(np.asarray(solution.success, dtype=bool) & ~same)
+    if away.size:
+        raise ValueError(f"method {name!r} solves state {away[0]} from {solution.x[away[0], 0].tolist()}, but the "
+                         f"comparison starts it at {x0[away[0]].tolist()}: pass the Solution's x0 to compare")
+    if wrong := _off_grid(ocp, solution):
+        raise ValueError(f"method {name!r}: {wrong}")
+
+
+def _off_grid(ocp: OCP, solution: Any) -> str:
+    """What is wrong with a solution's grid for running it in open loop, or ""."""
+    t = np.atleast_2d(solution.t)
+    if np.allclose(t, np.linspace(0.0, ocp.horizon, t.shape[1]), rtol=0, atol=1e-9 * ocp.horizon):
+        return ""
+    steps = np.diff(t)
+    return (f"its grid goes from {t.min():g} to {t.max():g} in steps of {steps.min():.4g} to {steps.max():.4g}; "
+            f"expected equal steps from 0 to the horizon {ocp.horizon:g}: compare it in closed loop, by controller()")
+
+
+def solve(solver: Any, name: str, x0: Array, solving: Solving) -> list[tuple[Any, float] | str]:
+    """(Solution, seconds a state) of all states at once; where that raises, state by state, what was raised instead."""
+    out = None if solving.out is None else solving.out / "solves" / "".join(c if c.isalnum() else "_" for c in name)
+    given = {"workers": solving.workers, "out": out, "progress": solving.progress}
+    takes = inspect.signature(solver.solve).parameters
+    options = {key: value for key, value in given.items() if key in takes}
+    start = time.perf_counter()
+    try:
+        solution = solver.solve(x0, **options)
+    except Exception as error:  # a solver may raise anything: it becomes a row
+        if len(x0) == 1:
+            return [said(error)]
+        alone = Solving(1, None, solving.progress)
+        return [solve(solver, name, x[None], alone)[0] for x in x0]
+    return [(solution, (time.perf_counter() - start) / len(x0))]
+
+
+def planned(ocp: OCP, name: str, method: Any, parts: Sequence[tuple[Any, float] | str], B: int) -> Run:
+    """The run of solutions that stand in the order of the states; a str is what a solve raised."""
+    K = max((part[0].u.shape[1] for part in parts if not isinstance(part, str)), default=1)
+    nx, nu = ocp.system.nx, ocp.system.nu
+    message, u = list[str](), np.full((B, K, nu), np.nan)
+    plan = Plan(np.full((B, K + 1, nx), np.nan), np.full((B, K + 1, nx), np.nan))
+    ms, predicted, evaluations, solves = *np.full((3, B), np.nan), np.ones(B)
+    for part in parts:
+        i = len(message)
+        if isinstance(part, str):
+            message.append(part)
+            continue
+        s, seconds = part
+        rows = slice(i, i + len(s.u))
+        u[rows], predicted[rows], plan.x[rows] = s.u, s.cost, s.x
+        plan.costate[rows] = s.costate if hasattr(s, "costate") else s.V_x
+        ms[rows] = 1e3 * np.asarray(getattr(s, "seconds", seconds))
+        evaluations[rows] = s.iterations * K * STAGES * getattr(method, "substeps", 1)
+        starts = getattr(s, "starts", None)
+        solves[rows] = 1 if starts is None else np.maximum(starts, 1)
+        message += _unsolved(ocp, s)
+    u[[bool(m) for m in message]] = np.nan
+    solved = Solved(ms, solves, predicted, evaluations, plan, message)
+    return Run(name, f"{OPEN_LOOP}, held on {count(K, 'interval')}", method, u, solved=solved)
+
+
+def _unsolved(ocp: OCP, solution: Any) -> list[str]:
+    """"" for each state that a solver solved, else why its answer is not judged."""
+    outcome = zip(solution.success, solution.message, strict=True)
+    off_grid = _off_grid(ocp, solution)
+    return [off_grid if ok else f"not solved: {why}" for ok, why in outcome]
+
+
+def said(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
