@@ -18,16 +18,24 @@ from nocl.solvers import NMPC
 from nocl.solvers.bank import SolutionBank, extend, solve_globally
 from nocl.solvers.cnd import TrainSettings
 from nocl.solvers.cnd.features import policy_net
-from nocl.solvers.cnd.labels import Labels, answered, continuous_cost, kicked_rollout, policy_controls, tube
+from nocl.solvers.cnd.labels import (
+    SMALL,
+    Labels,
+    answered,
+    continuous_cost,
+    kicked_rollout,
+    policy_controls,
+    tube,
+)
 from nocl.solvers.cnd.regress import fit, policy_loss
 from nocl.solvers.cnd.value import ROUND, ValueLabels, value_loss, value_net, value_solutions
 from nocl.solvers.ddp import DDP
 
 module = importlib.import_module("nocl.solvers.cnd.train")  # the package has a function of that name
 
-SMALL = TrainSettings(intervals=40, seeds=4, starts=2, states=60, tails=400, visits=200, rounds=0, iterations=800,
+QUICK = TrainSettings(intervals=40, seeds=4, starts=2, states=60, tails=400, visits=200, rounds=0, iterations=800,
                       batch=512, hidden=(24, 24), value_tails=800, value_iterations=800, held_out=16, gap_median=1e-9)
-TINY = replace(SMALL, intervals=20, batch=64, states=10, tails=40, visits=20, rounds=2, iterations=30, hidden=(8,),
+TINY = replace(QUICK, intervals=20, batch=64, states=10, tails=40, visits=20, rounds=2, iterations=30, hidden=(8,),
                value_tails=40, value_iterations=20, held_out=4)
 
 
@@ -43,7 +51,7 @@ def riccati(t, T=2.0, R=0.01):
 @pytest.fixture(scope="module")
 def integrator():
     ocp = nocl.load_ocp("double_integrator")
-    return ocp, nocl.train(ocp, settings=SMALL, seed=0, progress=False)
+    return ocp, nocl.train(ocp, settings=QUICK, seed=0, progress=False)
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +135,7 @@ def test_a_trained_controller_exports_and_comes_back(integrator, tmp_path):
 @pytest.mark.slow
 def test_pendulum_swings_up():
     ocp = nocl.load_ocp("pendulum")
-    settings = replace(SMALL, intervals=80, states=150, tails=1000, visits=600, rounds=1, iterations=1500,
+    settings = replace(QUICK, intervals=80, states=150, tails=1000, visits=600, rounds=1, iterations=1500,
                        hidden=(48, 48), value_iterations=2000)
     cnd = nocl.train(ocp, settings=settings, seed=0, progress=False)
     x0 = ocp.initial_states.sample(20, 99)
@@ -220,7 +228,7 @@ def test_what_cannot_be_trained_is_refused():
     with pytest.raises(ValueError, match="settings is a dict; this method takes TrainSettings"):
         nocl.train(ocp, settings={"seeds": 3})
     with pytest.raises(ValueError, match="this method takes PaperSettings"):
-        nocl.train(ocp, method="paper", settings=SMALL)
+        nocl.train(ocp, method="paper", settings=QUICK)
 
 
 def test_dynamics_of_another_system_are_refused():
@@ -234,11 +242,14 @@ def test_dynamics_of_another_system_are_refused():
 def test_labels_stand_at_the_middle_of_each_interval(pendulum):
     ocp, ddp, bank, f = pendulum
     solution = bank.solution[:3]
-    labels, K = Labels.of(solution, f), ddp.intervals
+    unit = 0.3
+    labels, K = Labels.of(solution, f, unit), ddp.intervals
     assert len(labels) == 3 * K
     h = ocp.horizon / K
     assert labels.t.reshape(3, K) == pytest.approx(np.tile((np.arange(K) + 0.5) * h, (3, 1)))
-    assert labels.weight == pytest.approx(h)
+    cost = np.repeat(np.abs(solution.cost) + SMALL * unit, K)
+    assert labels.weight == pytest.approx(h / cost)
+    assert not labels.dt.any()
     assert np.array_equal(labels.u.reshape(3, K, 1), solution.u)
     nodes, u = (torch.from_numpy(z.reshape(3 * K, -1)) for z in (solution.x[:, :-1], solution.u))
     middle = rk4_interval(f, nodes, u, h / 2, substeps=50)
@@ -248,7 +259,7 @@ def test_labels_stand_at_the_middle_of_each_interval(pendulum):
 def test_labels_of_what_failed_are_dropped(pendulum):
     _, ddp, bank, f = pendulum
     failed = replace(bank.solution[:3], success=np.array([True, False, True]))
-    assert len(Labels.of(failed, f)) == 2 * ddp.intervals
+    assert len(Labels.of(failed, f, 1.0)) == 2 * ddp.intervals
     assert len(ValueLabels.of([failed, bank.solution[:1]])) * 2 == len(ValueLabels.of([bank.solution[:6]]))
 
 
@@ -320,7 +331,8 @@ def loss_parts(u_label):
     ocp = nocl.load_ocp("pendulum")
     rng = np.random.default_rng(0)
     n = len(u_label)
-    labels = Labels(rng.standard_normal((n, 2)), rng.uniform(0, 3, n), np.array(u_label)[:, None], np.ones(n))
+    labels = Labels(rng.standard_normal((n, 2)), rng.uniform(0, 3, n), np.array(u_label)[:, None], np.ones(n),
+                    np.zeros(n))
     net, inverse = policy_net(ocp, labels, (4,))
     answer = torch.nn.Linear(1, 1)  # stands for the network: whatever the features, it answers `y`
     answer.y = None

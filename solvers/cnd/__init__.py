@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from nocl.solvers.cnd.controller import CND, pretrained
-from nocl.solvers.cnd.train import TrainSettings, train
+from nocl.solvers.cnd.settings import TrainSettings
+from nocl.solvers.cnd.train import train
 
 __all__ = ["CND", "TrainSettings", "pretrained", "train"]

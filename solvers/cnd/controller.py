@@ -20,6 +20,8 @@ from nocl.nets import FeatureNet
 from nocl.ocp import OCP
 from nocl.parity import Certificate, Part
 from nocl.simulate import dynamics_function
+from nocl.solvers.cnd.features import at_rate
+from nocl.solvers.cnd.labels import LONGEST
 from nocl.to_casadi import to_casadi
 from nocl.to_torch import to_torch
 
@@ -33,7 +35,8 @@ class CND:
     Parameters
     ----------
     ocp : OCP
-    policy : FeatureNet (x, t) -> u
+    policy : FeatureNet (x, t) -> u, or (x, t, dt) -> u
+        With dt it is optimal in continuous time at dt = 0, and held for dt at others: see `at_rate`.
     value : FeatureNet (x, t) -> V, optional
     card : mapping
         How it was made and how it scored: plain JSON data.
@@ -42,7 +45,9 @@ class CND:
     def __init__(self, ocp: OCP, policy: FeatureNet, value: FeatureNet | None = None,
                  card: Mapping[str, Any] | None = None) -> None:
         self.ocp, self.card = ocp, dict(card or {})
-        self.policy = policy.double().eval().requires_grad_(False)
+        policy.double().eval().requires_grad_(False)
+        self._at_rates = policy if policy.inputs.n_in() == 3 else None
+        self.policy = policy if self._at_rates is None else at_rate(policy, 0.0)
         self.value_net = None if value is None else value.double().eval().requires_grad_(False)
 
     def __call__(self, x: ArrayLike, t: ArrayLike = 0.0) -> Array:
@@ -51,6 +56,20 @@ class CND:
         with torch.no_grad():
             u = self.policy(*self._tensors(rows, t)).numpy()
         return u[0] if single else u
+
+    def at_rate(self, dt: float) -> CND:
+        """The same controller for a sampling time dt [s]: u(x, t) is asked at multiples of dt and held until the next.
+
+        What comes back is a CND of (x, t) like any other: it is called, judged (`simulate(..., hold=K)`) and exported.
+        dt = 0 is continuous feedback. Raises ValueError for dt beyond what was trained, or where none was.
+        """
+        if self._at_rates is None:
+            raise ValueError(f"this controller of {self.ocp.system.name} knows one rate only: train with "
+                             "TrainSettings(control_dt=True)")
+        longest = self.ocp.horizon / LONGEST
+        if not (isinstance(dt, (int, float)) and 0 <= dt <= longest * (1 + 1e-9)):
+            raise ValueError(f"dt is {dt!r}; expected 0 to {longest:g} s, the horizon over {LONGEST}, as trained")
+        return CND(self.ocp, at_rate(self._at_rates, float(dt)), self.value_net, self.card | {"dt": float(dt)})
 
     def value(self, x: ArrayLike, t: ArrayLike = 0.0) -> Array:
         """V(x, t), the cost-to-go: a number at [nx], or [B] at [B, nx]."""
@@ -136,9 +155,16 @@ class CND:
 
         return export(self, folder, to, **options)
 
+    def plot_training(self, path: str | os.PathLike[str]) -> Path:
+        """A picture of how it was trained, as a png at `path`: losses, and the gap on held-out states by round."""
+        from nocl.solvers.cnd.plot import plot_training
+
+        return plot_training(self.card, Path(path), self.ocp.system.name)
+
     def save(self, folder: str | os.PathLike[str]) -> Path:
         """Write controller, value, problem and card as one data-only file in `folder`."""
-        nets = {"policy": _single(self.policy)} | ({} if self.value_net is None else {"value": _single(self.value_net)})
+        policy = self.policy if self._at_rates is None else self._at_rates
+        nets = {"policy": _single(policy)} | ({} if self.value_net is None else {"value": _single(self.value_net)})
         return store.save(Path(folder), KIND, nets=nets, card={"ocp": self.ocp.to_data(), "card": self.card})
 
     @classmethod

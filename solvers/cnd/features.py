@@ -7,7 +7,7 @@ optimal gain grows like 1 / (T - t).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import casadi as ca
 import numpy as np
@@ -23,24 +23,28 @@ DEGREE = 6  # of the polynomials in time
 LEAST_TIME = 0.025  # of the horizon: time to go is never counted as less
 
 
-def features(ocp: OCP, x: Array, t: Array, plain: bool = False) -> ca.Function:
+def features(ocp: OCP, x: Array, t: Array, dt: Array | None = None, *, plain: bool = False) -> ca.Function:
     """(x, t) -> phi, each feature with mean 0 and standard deviation 1 over the labels x [n, nx], t [n].
 
+    With dt [n] it is (x, t, dt) -> phi: the clock then stands at the middle of the time that a control is held for.
     `plain` adds the state in units that do not change with time.
     """
-    s, time = ocp.system, ca.SX.sym("t")
+    s, start, held = ocp.system, ca.SX.sym("t"), ca.SX.sym("dt")
+    time = start if dt is None else start + held / 2
     tau = 2 * time / ocp.horizon - 1
     to_go = ca.fmax(ocp.horizon - time, 0)
-    mean, spread = _moments_in_time(x, 2 * t / ocp.horizon - 1)
+    mean, spread = _moments_in_time(x, 2 * (t if dt is None else t + dt / 2) / ocp.horizon - 1)
     standard = (s.x - _polynomial(mean, tau)) / ca.exp(_polynomial(spread, tau))
     angles = [g(s.x[i]) for i in s.angle_indices for g in (ca.sin, ca.cos)]
     rush = (s.x - ca.DM(ocp.x_goal)) / (to_go + LEAST_TIME * ocp.horizon)
     clock = ca.vertcat(tau, ca.log(to_go / ocp.horizon + LEAST_TIME) / 2)
-    raw = ca.vertcat(standard, *angles, clock, rush, s.x if plain else ca.SX(0, 1))
+    raw = ca.vertcat(standard, *angles, clock, rush, s.x if plain else ca.SX(0, 1), *([] if dt is None else [held]))
+    given = [x, t] if dt is None else [x, t, dt]
+    names, args = ["x", "t", "dt"][:len(given)], [s.x, start, held][:len(given)]
     some = slice(None, None, -(-len(t) // 20_000))  # of every kind of label
-    values = ca.Function("raw", [s.x, time], [raw])(x[some].T, t[None, some]).full()
+    values = ca.Function("raw", args, [raw])(*(np.atleast_2d(a[some].T) for a in given)).full()
     centre, width = values.mean(axis=1), values.std(axis=1) + 1e-6
-    return ca.Function("features", [s.x, time], [(raw - ca.DM(centre)) / ca.DM(width)], ["x", "t"], ["phi"])
+    return ca.Function("features", args, [(raw - ca.DM(centre)) / ca.DM(width)], names, ["phi"])
 
 
 def _moments_in_time(x: Array, tau: Array) -> tuple[Array, Array]:
@@ -62,13 +66,26 @@ def _polynomial(coefficients: Array, tau: ca.SX) -> ca.SX:
     return ca.DM(coefficients) @ ca.vertcat(*basis[: coefficients.shape[1]])
 
 
-def policy_net(ocp: OCP, labels: Labels, sizes: tuple[int, ...]) -> tuple[FeatureNet, ca.Function]:
-    """(u = clip(mean + spread * y, U), y a tanh network of the features; and u -> y, its inverse inside U)."""
-    s, time = ocp.system, ca.SX.sym("t")
-    phi = features(ocp, labels.x, labels.t)
+def policy_net(ocp: OCP, labels: Labels, sizes: tuple[int, ...],
+               control_dt: bool = False) -> tuple[FeatureNet, ca.Function]:
+    """(u = clip(mean + spread * y, U), y a tanh network of the features; and u -> y, its inverse inside U).
+
+    control_dt: (x, t, dt) -> u in place of (x, t) -> u.
+    """
+    s = ocp.system
+    phi = features(ocp, labels.x, labels.t, labels.dt if control_dt else None)
     mean, spread = ca.DM(labels.u.mean(axis=0)), ca.DM(labels.u.std(axis=0) + 1e-9)
     y, u = ca.SX.sym("y", s.nu), ca.SX.sym("u", s.nu)
     clipped = ca.fmin(ca.fmax(mean + spread * y, ca.DM(s.lbu)), ca.DM(s.ubu))
-    outputs = ca.Function("controls", [s.x, time, y], [clipped], ["x", "t", "y"], ["u"])
+    args = [ca.SX.sym(name, phi.size1_in(i)) for i, name in enumerate(phi.name_in())]
+    outputs = ca.Function("controls", [*args, y], [clipped], [*phi.name_in(), "y"], ["u"])
     net = FeatureNet(phi, [MLP([phi.numel_out(0), *sizes, s.nu])], outputs)
     return net, ca.Function("inverse", [u], [(u - mean) / spread], ["u"], ["y"])
+
+
+def at_rate(net: FeatureNet, dt: float) -> FeatureNet:
+    """(x, t) -> u of a network (x, t, dt) -> u at one dt; the layers are shared."""
+    x, t, y = (ca.SX.sym(name, net.outputs.size1_in(i)) for name, i in (("x", 0), ("t", 1), ("y", 3)))
+    phi = ca.Function("features", [x, t], [net.inputs(x, t, dt)], ["x", "t"], ["phi"])
+    outputs = ca.Function("controls", [x, t, y], [net.outputs(x, t, dt, y)], ["x", "t", "y"], ["u"])
+    return FeatureNet(phi, [cast(MLP, layers) for layers in net.nets], outputs)

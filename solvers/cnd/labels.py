@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -18,16 +19,20 @@ from nocl.solvers.ddp import DDP, DDPSolution
 from nocl.to_torch import to_torch
 
 Field = Callable[[Tensor, Tensor], Tensor]
+SMALL = 0.1  # of a usual cost: what is added to costs before anything is divided by them
+COARSE = (2, 5, 10, 20, 40, 160, 640)  # intervals of tails that are solved for other control rates than the labels'
+LONGEST = 40  # a control is held for the horizon over LONGEST at most
 
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """Controls at the middle of each interval, where a held control equals the continuous one to second order."""
+    """Optimal controls: continuous ones (dt = 0), and ones that are held for dt from t on."""
 
     x: Array  # [n, nx]
     t: Array  # [n]
     u: Array  # [n, nu]
-    weight: Array  # [n], the length of the interval
+    weight: Array  # [n], the length of the interval over the cost from the solution's start: relative costs count
+    dt: Array  # [n]
 
     def __len__(self) -> int:
         return len(self.t)
@@ -36,21 +41,48 @@ class Labels:
         return Labels(*(getattr(self, name)[rows] for name in Labels.__dataclass_fields__))
 
     @staticmethod
-    def of(solution: DDPSolution, f: Field) -> Labels:
-        """Every interval of every solution that succeeded; f in torch gives the states between nodes."""
+    def held(solution: DDPSolution, unit: float) -> Labels:
+        """Every interval of every solution that succeeded, at its start, as controls held for its length.
+
+        unit: a usual cost; those far below it count as SMALL times it.
+        """
         s = solution[solution.success]
-        h = np.diff(s.t[:, :2], axis=1)
-        B, K, nu = s.u.shape
-        x, u, step = s.x[:, :-1].reshape(B * K, -1), s.u.reshape(-1, nu), np.repeat(h, K)
-        t = s.t[:, :-1].ravel()
+        K, nu = s.u.shape[1:]
+        h = np.repeat(np.diff(s.t[:, :2], axis=1), K)
+        cost = np.repeat(np.abs(s.V[:, 0]), K) + SMALL * unit
+        return Labels(s.x[:, :-1].reshape(len(h), -1), s.t[:, :-1].ravel(), s.u.reshape(-1, nu), h / cost, h)
+
+    @staticmethod
+    def of(solution: DDPSolution, f: Field, unit: float) -> Labels:
+        """The same as continuous controls: at the middle of its interval a held one equals them to second order.
+
+        f in torch gives the states between nodes.
+        """
+        start = Labels.held(solution, unit)
         with torch.no_grad():
-            half = torch.from_numpy(step / 2)[:, None]
-            middle = rk4(f, torch.from_numpy(x), torch.from_numpy(u), half).numpy()
-        return Labels(middle, t + step / 2, u, step)
+            half = torch.from_numpy(start.dt / 2)[:, None]
+            middle = rk4(f, torch.from_numpy(start.x), torch.from_numpy(start.u), half).numpy()
+        return Labels(middle, start.t + start.dt / 2, start.u, start.weight, np.zeros(len(start)))
 
     @staticmethod
     def join(parts: list[Labels]) -> Labels:
         return Labels(*(np.concatenate([getattr(p, name) for p in parts]) for name in Labels.__dataclass_fields__))
+
+
+def at_other_rates(ddp: DDP, solution: DDPSolution, unit: float, rng: np.random.Generator) -> Labels:
+    """Held controls from the same states as a solution's, each solved on another number of intervals, from its own."""
+    done = solution[solution.success]
+    left, most = ddp.ocp.horizon - done.t[:, 0], ddp.ocp.horizon / LONGEST * (1 + 1e-9)
+    allowed = left[:, None] / np.array(COARSE) <= most
+    chosen = (rng.random(allowed.shape) * allowed).argmax(axis=1)
+    parts = []
+    for k in np.unique(chosen):
+        rows, N, K = np.flatnonzero(chosen == k), COARSE[k], ddp.intervals
+        nearest = ((np.arange(N) + 0.5) * K / N).astype(int)
+        other = copy.copy(ddp)  # the same compiled kernel
+        other.intervals = N
+        parts.append(Labels.held(other.solve(done.x[rows, 0], done.t[rows, 0], u=done.u[rows][:, nearest]), unit))
+    return Labels.join(parts)
 
 
 def tube(ddp: DDP, bank: SolutionBank, n: int, width: float, rng: np.random.Generator) -> DDPSolution:
@@ -72,7 +104,13 @@ def tube_states(bank: SolutionBank, n: int, width: float, horizon: float,
 def visited(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, n: int, kick: float,
             rng: np.random.Generator) -> DDPSolution:
     """Tails from n states that the policy visits under kicks."""
-    ocp = ddp.ocp
+    x, t0 = kicked_states(ddp.ocp, bank, policy, f, n, kick, rng)
+    return answered(ddp, bank, policy, f, x, t0)
+
+
+def kicked_states(ocp: OCP, bank: SolutionBank, policy: torch.nn.Module, f: Field, n: int, kick: float,
+                  rng: np.random.Generator) -> tuple[Array, Array]:
+    """(x, t0) of n states, or fewer, that the policy visits under kicks, at any time: those not far out of the box."""
     x0 = ocp.initial_states.sample(max(n // 8, 1), rng)
     t, x = kicked_rollout(ocp, policy, f, x0, kick * bank.scale, rng)
     rows, k = rng.integers(0, len(x), n), rng.integers(0, len(t) - 1, n)
@@ -82,7 +120,7 @@ def visited(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, n: 
     if not fine.any():
         raise ValueError(f"the controller of {ocp.system.name} drives every state far out of the box: train for more "
                          "iterations, in a narrower tube (TrainSettings.width) or with smaller pushes (.kick)")
-    return answered(ddp, bank, policy, f, x[fine], t0[fine])
+    return x[fine], t0[fine]
 
 
 def answered(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, x: Array, t0: Array) -> DDPSolution:
@@ -120,8 +158,12 @@ def policy_controls(policy: torch.nn.Module, f: Field, x: Array, t0: Array, hori
     return torch.stack(controls, dim=1).numpy()
 
 
-def continuous_cost(ocp: OCP, policy: torch.nn.Module, f: Field, x0: Array, steps: int) -> Array:
-    """J [B] of the policy as continuous feedback from x0, by RK4 on (x, t, cost); soft path constraints included."""
+def continuous_cost(ocp: OCP, policy: torch.nn.Module, f: Field, x0: Array, steps: int,
+                    t0: float | Array = 0.0) -> Array:
+    """J [B] of the policy as continuous feedback from (x0, t0), t0 a number or [B], by RK4 on (x, t, cost).
+
+    Soft path constraints included.
+    """
     n, L = x0.shape[1], to_torch(ocp.L_soft)
 
     def closed_loop(z: Tensor, _: None) -> Tensor:
@@ -129,8 +171,10 @@ def continuous_cost(ocp: OCP, policy: torch.nn.Module, f: Field, x0: Array, step
         u = policy(x, t)
         return torch.cat([f(x, u), torch.ones_like(t), L(x, u)], dim=1)
 
-    z = torch.cat([torch.from_numpy(x0), torch.zeros(len(x0), 2, dtype=torch.float64)], dim=1)
+    start = np.broadcast_to(np.asarray(t0, dtype=np.float64), len(x0))
+    z = torch.from_numpy(np.column_stack([x0, start, np.zeros(len(x0))]))
+    h = torch.from_numpy((ocp.horizon - start) / steps)[:, None]
     with torch.no_grad():
         for _ in range(steps):
-            z = rk4(closed_loop, z, None, ocp.horizon / steps)
+            z = rk4(closed_loop, z, None, h)
         return (z[:, n + 1] + to_torch(ocp.G)(z[:, :n])[:, 0]).numpy()

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nocl.checks import Array
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.cnd.labels import Labels
@@ -47,16 +46,17 @@ def _cosine(progress: float) -> float:
 
 
 def policy_loss(ocp: OCP, net: FeatureNet, inverse: ca.Function, labels: Labels) -> Loss:
-    """Mean of h (u - u*)' R (u - u*), R from L: for control-affine problems the cost lost along the labelled paths.
+    """Mean of w (u - u*)' R (u - u*), R from L, w the label's weight: an interval's length over its solution's cost.
 
-    Answers beyond a bound that is active in the label cost nothing: they are clipped to it.
+    For control-affine problems that is the cost lost along the labelled paths, as a share of what they cost. Answers
+    beyond a bound that is active in the label cost nothing: they are clipped to it.
     """
     to_y = to_torch(inverse)
     target = to_y(torch.from_numpy(labels.u)).float()
     low, high = (to_y(torch.from_numpy(np.array(b))[None]).float() for b in (ocp.system.lbu, ocp.system.ubu))
     lowest, highest = target <= low + 1e-4, target >= high - 1e-4
     weight = torch.from_numpy(labels.weight / labels.weight.mean()).float()[:, None] * _control_weights(ocp, low, high)
-    (phi,) = _features(net, labels.x, labels.t)
+    phi = _features(net, labels)
 
     def loss(rows: Tensor) -> Tensor:
         y, wanted = net.nets[0](phi[rows]), target[rows]
@@ -76,6 +76,7 @@ def _control_weights(ocp: OCP, low: Tensor, high: Tensor) -> Tensor:
     return weights / weights.mean()
 
 
-def _features(net: FeatureNet, x: Array, t: Array) -> tuple[Tensor, ...]:
-    """The features of all labels, in float32."""
-    return tuple(p.float() for p in net.features(torch.from_numpy(x), torch.from_numpy(t)[:, None]))
+def _features(net: FeatureNet, labels: Labels) -> Tensor:
+    """The features of all labels [n, F], in float32."""
+    args = [torch.from_numpy(a) for a in (labels.x, labels.t[:, None], labels.dt[:, None])]
+    return net.features(*args[:net.inputs.n_in()])[0].float()

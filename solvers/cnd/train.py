@@ -16,9 +16,10 @@ import hashlib
 import json
 import os
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,11 +33,21 @@ from nocl.nets import FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.bank import SolutionBank, extend, solve_globally
 from nocl.solvers.cnd.controller import CND
-from nocl.solvers.cnd.features import policy_net
-from nocl.solvers.cnd.labels import Labels, continuous_cost, tube, visited
+from nocl.solvers.cnd.features import at_rate, policy_net
+from nocl.solvers.cnd.labels import Labels, at_other_rates, tube, visited
 from nocl.solvers.cnd.regress import fit, policy_loss
+from nocl.solvers.cnd.settings import TrainSettings
+from nocl.solvers.cnd.validate import (
+    advice,
+    gap,
+    held_gap,
+    held_out_optima,
+    kicked_optima,
+    summary,
+    value_scores,
+)
 from nocl.solvers.cnd.value import ValueLabels, value_loss, value_net, value_solutions
-from nocl.solvers.ddp import DDP
+from nocl.solvers.ddp import DDP, DDPSolution
 from nocl.symbolic import to_data
 from nocl.threads import one_thread
 from nocl.to_torch import to_torch
@@ -45,44 +56,10 @@ if TYPE_CHECKING:
     from nocl.solvers.cnd.paper import PaperSettings
     from nocl.sysid import LearnedDynamics
 
+__all__ = ["TrainSettings", "train"]
 CHECKPOINT = "training.safetensors"
+LOSSES = 40  # of each regression that the card keeps
 STREAM = 0x6E6F636C  # training's own random numbers: never those of initial_states.sample(n, seed), whatever the seeds
-
-
-@dataclass(frozen=True)
-class TrainSettings:
-    """The default method's settings."""
-
-    intervals: int = 80  # RK4 steps and held controls of each labelled solution
-    seeds: int = 20  # initial states solved globally, from cold starts
-    starts: int = 16  # cold starts of each
-    states: int = 400  # further initial states, solved from their neighbours
-    tails: int = 3000  # optimal tails from the tube
-    width: float = 0.25  # of the tube, in units of each state's spread along the solutions
-    visits: int = 2000  # visited states solved in each round
-    kick: float = 0.1  # pushes on the visiting policy, in units of each state's spread
-    rounds: int = 3  # of visited states, at most
-    least_rounds: int = 2  # and at least: the gap is met sooner than under disturbances
-    iterations: int = 2000  # of each regression; twice as many from the round on that may be the last
-    batch: int = 1024
-    lr: float = 4e-3
-    hidden: tuple[int, ...] = (64, 64, 64)
-    value: bool = True  # whether to train V(x, t) too
-    value_tails: int = 3000  # solved for V, from the tube and from the policy's own answers
-    value_iterations: int = 3000
-    held_out: int = 64  # initial states that tell when to stop
-    gap_median: float = 2e-4  # stop once both are met: (J - J*) / J*, median over the held-out states,
-    gap_p95: float = 1e-3  # and its 95th percentile
-
-    def __post_init__(self) -> None:
-        for f in fields(self):
-            value, least = getattr(self, f.name), 0 if f.name in ("rounds", "least_rounds", "states", "tails") else 1
-            if f.type == "int" and (isinstance(value, bool) or not isinstance(value, int) or value < least):
-                raise ValueError(f"TrainSettings: {f.name} is {value!r}; expected a whole number of at least {least}")
-            if f.type == "float" and not (isinstance(value, (int, float)) and 0 < value < float("inf")):
-                raise ValueError(f"TrainSettings: {f.name} is {value!r}; expected a positive number")
-        if not self.hidden or not all(isinstance(h, int) and h > 0 for h in self.hidden):
-            raise ValueError(f"TrainSettings: hidden is {self.hidden!r}; expected widths such as (64, 64, 64)")
 
 
 def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "default",
@@ -152,6 +129,8 @@ class _Training:
         self.hidden_progress = None if progress is None else not progress
         self.round, self.seconds = 0, 0.0
         self.history: list[dict[str, Any]] = []
+        self.losses: list[float] = []
+        self.value_card: dict[str, Any] = {}
 
     def run(self) -> CND:
         with one_thread():
@@ -169,8 +148,10 @@ class _Training:
             self._validate()
             self.round += 1
             self._save()
+        if (remark := advice(self.history[-1], self.round - 1)) is not None:
+            warnings.warn(f"{self.ocp.system.name}: {remark}", stacklevel=4)
         value = self._value() if s.value else None
-        return CND(self.ocp, self.policy, value, self._card())
+        return CND(self.ocp, self.net, value, self._card())
 
     def _first_labels(self) -> None:
         s, rng = self.settings, self._rng(0)
@@ -186,41 +167,62 @@ class _Training:
                 more = extend(self.ddp, self.bank, self.ocp.initial_states.sample(s.states, rng))
                 self.bank = SolutionBank.of(self.ddp, type(more).join([seeds, more]))
             parts = [self.bank.solution] + ([tube(self.ddp, self.bank, s.tails, s.width, rng)] if s.tails else [])
-            self.labels = Labels.join([Labels.of(p, self.f) for p in parts])
+            self.labels = Labels.join([self._labels(p, rng) for p in parts])
             self.first = len(self.labels)
+
+    def _labels(self, solution: DDPSolution, rng: np.random.Generator) -> Labels:
+        """Labels of the continuous controls, and with control_dt of held ones."""
+        parts = [Labels.of(solution, self.f, self._unit())]
+        if self.settings.control_dt:
+            parts += [Labels.held(solution, self._unit()), at_other_rates(self.ddp, solution, self._unit(), rng)]
+        return Labels.join(parts)
+
+    def _unit(self) -> float:
+        """A usual cost from an initial state."""
+        return float(np.median(np.abs(self.bank.solution.cost)))
 
     def _network(self) -> None:
         """The policy's networks, scaled by the first labels."""
         with _seeded(self.seed):
-            self.policy, self.inverse = policy_net(self.ocp, self.labels[: self.first], self.settings.hidden)
+            self.net, self.inverse = policy_net(self.ocp, self.labels[: self.first], self.settings.hidden,
+                                                self.settings.control_dt)
+        self.policy = at_rate(self.net, 0.0) if self.settings.control_dt else self.net  # in continuous time
 
     def _visit(self) -> None:
-        s = self.settings
+        s, rng = self.settings, self._rng(self.round)
         with self._stage(f"round {self.round}: visited states", 1) as bar:
-            solved = visited(self.ddp, self.bank, self.policy, self.f, s.visits, s.kick, self._rng(self.round))
-            self.labels = Labels.join([self.labels, Labels.of(solved, self.f)])
+            solved = visited(self.ddp, self.bank, self.policy, self.f, s.visits, s.kick, rng)
+            self.labels = Labels.join([self.labels, self._labels(solved, rng)])
             bar.update()
 
     def _regress(self, iterations: int) -> None:
         s = self.settings
-        loss = policy_loss(self.ocp, self.policy, self.inverse, self.labels)
+        loss = policy_loss(self.ocp, self.net, self.inverse, self.labels)
         with self._stage(f"round {self.round}: controller", iterations) as bar:
-            fit(self.policy, loss, len(self.labels), iterations=iterations, batch=s.batch, lr=s.lr,
-                seed=self.seed + self.round, report=_reporter(bar))
+            report = _Reporter(bar, iterations)
+            fit(self.net, loss, len(self.labels), iterations=iterations, batch=s.batch, lr=s.lr,
+                seed=self.seed + self.round, report=report)
+        self.losses = report.kept
 
     def _validate(self) -> None:
-        """The gap to the optimum as continuous-time feedback, on initial states that no label starts from."""
-        x0 = self.ocp.initial_states.sample(self.settings.held_out, self._rng(1_000_000))
+        """The gap to the optimum as continuous-time feedback, on initial states that no label starts from, and
+        on states of kicked rollouts."""
+        s, rng = self.settings, self._rng(1_000_000)
         with self._stage("held-out states", 1) as bar:
-            coarse = extend(self.ddp, self.bank, x0)
-            best = self.fine.solve(x0, u=np.repeat(coarse.u, 4, axis=1))
-            J = continuous_cost(self.ocp, self.policy, self.f, x0, self.fine.intervals)
-            gap = (J - best.cost)[best.success] / np.abs(best.cost[best.success])
-            median, p95 = np.quantile(gap, [0.5, 0.95]) if len(gap) else (np.nan, np.nan)
-            bar.set_postfix_str(f"gap {100 * median:.3f} %, p95 {100 * p95:.3f} %")
+            solvers, x0 = (self.ddp, self.fine, self.bank), self.ocp.initial_states.sample(s.held_out, rng)
+            self.starts = held_out_optima(*solvers, x0)
+            self.tails = kicked_optima(*solvers, self.policy, self.f, 4 * s.held_out, s.kick, rng)
+            row = {"round": self.round, "labels": len(self.labels), "loss": self.losses,
+                   **summary(gap(self.ocp, self.policy, self.f, self.starts), "gap"),
+                   **summary(gap(self.ocp, self.policy, self.f, self.tails, self._unit()), "kicked")}
+            if s.control_dt:
+                best = extend(self.ddp, self.bank, self.starts.x[:, 0])
+                held = at_rate(self.net, self.ocp.horizon / s.intervals)
+                row |= summary(held_gap(self.ocp, held, self.f, best), "held")
+            bar.set_postfix_str(f"gap {100 * row['gap_median']:.3f} %, p95 {100 * row['gap_p95']:.3f} %, "
+                                f"kicked {100 * row['kicked_median']:.3f} %")
             bar.update()
-        self.history.append({"round": self.round, "labels": len(self.labels), "gap_median": float(median),
-                             "gap_p95": float(p95)})
+        self.history.append(row)
 
     def _good_enough(self) -> bool:
         if self.round <= self.settings.least_rounds:
@@ -238,15 +240,21 @@ class _Training:
             net = value_net(self.ocp, labels, s.hidden)
         loss = value_loss(net, labels, self.bank.scale)
         with self._stage("value function", s.value_iterations) as bar:
+            report = _Reporter(bar, s.value_iterations)
             fit(net, loss, len(labels), iterations=s.value_iterations, batch=s.batch // 2 or 1, lr=s.lr,
-                seed=self.seed, report=_reporter(bar))
+                seed=self.seed, report=report)
+        if not hasattr(self, "starts"):  # taken up after the last round
+            self._validate()
+            self.history.pop()
+        scores = value_scores(self.ocp, net, self.policy, self.f, self.starts, self.tails)
+        self.value_card = {"loss": report.kept, **scores}
         return net
 
     def _card(self) -> dict[str, Any]:
         last = self.history[-1]
         return {"method": "default", "dynamics": "learned" if self.learned else "exact", "seed": self.seed,
                 "gap_median": last["gap_median"], "gap_p95": last["gap_p95"], "seconds": round(self.seconds, 1),
-                "settings": asdict(self.settings), "history": self.history}
+                "settings": asdict(self.settings), "history": self.history, "value": self.value_card}
 
     @contextmanager
     def _stage(self, name: str, total: int) -> Iterator[tqdm[Any]]:
@@ -265,7 +273,7 @@ class _Training:
     def _save(self) -> None:
         if self.checkpoint is None:
             return
-        state = {"policy": self.policy.state_dict(), "labels": _tensors(vars(self.labels)),
+        state = {"policy": self.net.state_dict(), "labels": _tensors(vars(self.labels)),
                  "bank": _tensors({k: v for k, v in vars(self.bank.solution).items() if k != "message"})}
         meta = {"identity": self._identity(), "round": self.round, "history": self.history, "seconds": self.seconds,
                 "first": self.first}
@@ -283,18 +291,25 @@ class _Training:
         self.bank = SolutionBank.from_arrays(self.ddp, _arrays(state["bank"]))
         self.round, self.history, self.seconds, self.first = (meta[k] for k in ("round", "history", "seconds", "first"))
         self._network()
-        self.policy.double().load_state_dict(state["policy"])
-        self.policy.eval().requires_grad_(False)
+        self.net.double().load_state_dict(state["policy"])
+        self.net.eval().requires_grad_(False)
         return True
 
 
-def _reporter(bar: tqdm[Any]) -> Any:
-    def report(loss: float) -> None:
-        bar.update()
-        if bar.n % 50 == 0:
-            bar.set_postfix_str(f"loss {loss:.2e}", refresh=False)
+class _Reporter:
+    """Told the loss of each iteration: moves the bar, and keeps LOSSES means over as many stretches."""
 
-    return report
+    def __init__(self, bar: tqdm[Any], iterations: int) -> None:
+        self.bar, self.every, self.kept = bar, max(iterations // LOSSES, 1), list[float]()
+        self.recent: list[float] = []
+
+    def __call__(self, loss: float) -> None:
+        self.bar.update()
+        self.recent.append(loss)
+        if len(self.recent) == self.every:
+            self.kept.append(float(f"{np.mean(self.recent):.3g}"))
+            self.recent = []
+            self.bar.set_postfix_str(f"loss {self.kept[-1]:.2e}", refresh=False)
 
 
 @contextmanager

@@ -1,0 +1,110 @@
+"""What training is told by: problems that no label starts from, solved anew on a fine grid."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from nocl.checks import Array
+from nocl.hjb import hjb_residual, rollout
+from nocl.nets import FeatureNet
+from nocl.ocp import OCP
+from nocl.solvers.bank import SolutionBank, extend
+from nocl.solvers.cnd.labels import SMALL, Field, answered, continuous_cost, kicked_states
+from nocl.solvers.ddp import DDP, DDPSolution
+from nocl.to_torch import to_torch
+
+NODES = 16  # of each solution at which the HJB residual is taken
+
+
+def refined(fine: DDP, coarse: DDPSolution) -> DDPSolution:
+    """The solutions that succeeded, solved again on the fine grid."""
+    s = coarse[coarse.success]
+    finer = fine.solve(s.x[:, 0], s.t[:, 0], u=np.repeat(s.u, fine.intervals // s.u.shape[1], axis=1))
+    return finer[finer.success]
+
+
+def held_out_optima(ddp: DDP, fine: DDP, bank: SolutionBank, x0: Array) -> DDPSolution:
+    """The optima of fresh initial states, from the bank's nearest."""
+    return refined(fine, extend(ddp, bank, x0))
+
+
+def kicked_optima(ddp: DDP, fine: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, n: int, kick: float,
+                  rng: np.random.Generator) -> DDPSolution:
+    """The optima from n states that the policy visits under kicks, at times all over the horizon."""
+    x, t0 = kicked_states(ddp.ocp, bank, policy, f, n, kick, rng)
+    return refined(fine, answered(ddp, bank, policy, f, x, t0))
+
+
+def gap(ocp: OCP, policy: torch.nn.Module, f: Field, best: DDPSolution, unit: float = 0.0) -> Array:
+    """(J - J*) / (|J*| + SMALL unit) [B] of the policy as continuous feedback, from where the solutions start."""
+    J = continuous_cost(ocp, policy, f, best.x[:, 0], best.u.shape[1], best.t[:, 0])
+    shares: Array = (J - best.cost) / (np.abs(best.cost) + SMALL * unit)
+    return shares
+
+
+def held_gap(ocp: OCP, policy: torch.nn.Module, f: Field, best: DDPSolution) -> Array:
+    """The same of a policy that is asked at the solutions' nodes and held; they start at t = 0."""
+    with torch.no_grad():
+        path = rollout(policy, f, to_torch(ocp.L_soft), torch.from_numpy(best.x[:, 0]), ocp.horizon, best.u.shape[1])
+        J = (path.running + to_torch(ocp.G)(path.x[:, -1]))[:, 0].numpy()
+    shares: Array = (J - best.cost) / np.abs(best.cost)
+    return shares
+
+
+def summary(shares: Array, name: str) -> dict[str, float]:
+    """Median and 95th percentile, NaN where there is none; a policy that blows up counts as infinitely bad."""
+    known = np.nan_to_num(shares, nan=np.inf)
+    median, p95 = np.quantile(known, [0.5, 0.95], method="higher") if len(known) else (np.nan, np.nan)
+    return {f"{name}_median": float(median), f"{name}_p95": float(p95)}
+
+
+def value_scores(ocp: OCP, value: FeatureNet, policy: torch.nn.Module, f: Field, starts: DDPSolution,
+                 tails: DDPSolution) -> dict[str, float]:
+    """|V - J*| / |J*| (mean, at initial states and on tails), V_x against costates (medians), the HJB residual.
+
+    The residual V_t + L + V_x' f is taken at the policy's u along the tails, in units of their mean running cost.
+    """
+    row: dict[str, float] = {}
+    for name, s in (("initial", starts), ("tails", tails)):
+        V, V_x = _value_and_slope(value, s.x[:, 0], s.t[:, 0])
+        row[f"{name}_error"] = float(np.mean(np.abs(V - s.cost) / np.abs(s.cost)))
+        size, true = np.linalg.norm(V_x, axis=1), np.linalg.norm(s.V_x[:, 0], axis=1)
+        cosine = np.clip((V_x * s.V_x[:, 0]).sum(axis=1) / (size * true), -1, 1)
+        row[f"{name}_degrees"] = float(np.degrees(np.median(np.arccos(cosine))))
+        row[f"{name}_slope_error"] = float(np.median(np.abs(size / true - 1)))
+    return row | _hjb(ocp, value, policy, f, tails)
+
+
+def _value_and_slope(value: FeatureNet, x: Array, t: Array) -> tuple[Array, Array]:
+    states = torch.from_numpy(x).clone().requires_grad_(True)
+    with torch.enable_grad():
+        V = value(states, torch.from_numpy(t)[:, None])
+        (slope,) = torch.autograd.grad(V.sum(), states)
+    return V.detach().numpy()[:, 0], slope.numpy()
+
+
+def _hjb(ocp: OCP, value: FeatureNet, policy: torch.nn.Module, f: Field, tails: DDPSolution) -> dict[str, float]:
+    every = slice(0, -1, max(tails.u.shape[1] // NODES, 1))
+    x = torch.from_numpy(np.ascontiguousarray(tails.x[:, every].reshape(-1, tails.x.shape[2])))
+    t = torch.from_numpy(np.ascontiguousarray(tails.t[:, every].reshape(-1, 1)))
+    L = to_torch(ocp.L_soft)
+    with torch.no_grad():
+        u = policy(x, t)
+        usual = float(L(x, u).abs().mean())
+    residual = hjb_residual(value, f, L, x, u, t).detach().abs().numpy()
+    return {"hjb_median": float(np.median(residual)) / usual, "hjb_mean": float(residual.mean()) / usual}
+
+
+def advice(row: dict[str, Any], rounds: int) -> str | None:
+    """What to say, and to try, where the last round's gap is large; None where it is not."""
+    if row["gap_median"] <= 0.01 and row["gap_p95"] <= 0.2:
+        return None
+    tries = ("more rounds or visits, wider layers (hidden=(128, 128, 128)) or more iterations"
+             if row["gap_median"] > 0.01 else
+             "more seeds and states, where basins of different optima meet, or wider layers")
+    return (f"the controller costs {100 * row['gap_median']:.2g} % more than the optimum (median; 95th percentile "
+            f"{100 * row['gap_p95']:.2g} %) on held-out initial states after {rounds} rounds; expected less than 1 %: "
+            f"try TrainSettings with {tries}")
