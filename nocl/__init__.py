@@ -13,6 +13,8 @@ from nocl.system import System
 
 if TYPE_CHECKING:
     from nocl.data import Dataset, Solution, Trajectory
+    from nocl.ensemble import Ensemble
+    from nocl.logs import Log
     from nocl.simulate import simulate
     from nocl.solvers.cnd import CND, pretrained, train
     from nocl.sysid import LearnedDynamics, identify
@@ -21,12 +23,13 @@ if TYPE_CHECKING:
     from nocl.to_torch import to_torch
 
 __version__ = "0.1.0"
-__all__ = ["CND", "OCP", "Dataset", "Gaussian", "LearnedDynamics", "Solution", "System", "Trajectory", "Uniform",
-           "identify", "load_ocp", "pretrained", "simulate", "to_casadi", "to_torch", "train"]
+__all__ = ["CND", "OCP", "Dataset", "Ensemble", "Gaussian", "LearnedDynamics", "Log", "Solution", "System",
+           "Trajectory", "Uniform", "identify", "load_ocp", "pretrained", "simulate", "to_casadi", "to_torch", "train"]
 
 _LAZY = {  # public name -> module: torch and the solvers are imported when first used
     "CND": "nocl.solvers.cnd", "train": "nocl.solvers.cnd", "pretrained": "nocl.solvers.cnd",
     "identify": "nocl.sysid", "LearnedDynamics": "nocl.sysid",
+    "Ensemble": "nocl.ensemble", "Log": "nocl.logs",
     "Dataset": "nocl.data", "Solution": "nocl.data", "Trajectory": "nocl.data",
     "load_ocp": "nocl.systems", "simulate": "nocl.simulate",
     "to_torch": "nocl.to_torch", "to_casadi": "nocl.to_casadi",

@@ -8,10 +8,11 @@ derivatives (nocl.fit). Where there is no structure to find, one network of all 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
@@ -20,20 +21,28 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from nocl import checks, store, sysid_paper
+from nocl.coverage import Coverage
 from nocl.data import Dataset
+from nocl.known import Known, Stated
+from nocl.logs import Log
 from nocl.nets import MLP, FeatureNet
 from nocl.sampling import Seed
 from nocl.structure import Box, Expansion, Group, Split, Structure
-from nocl.sysid_labels import Source, box_of, find_structure, labelled, rows_of
+from nocl.sysid_labels import Source, box_of, data_box, find_structure, labelled, rows_of
+from nocl.sysid_logs import first_states, fit_log
 from nocl.sysid_networks import assemble, fit_group, fit_groups, weights_of
 from nocl.sysid_progress import Checkpoint, Progress
 from nocl.sysid_score import Score, score_of
-from nocl.sysid_settings import PaperSettings, Settings
+from nocl.sysid_settings import LogSettings, PaperSettings, Settings
 from nocl.system import System
 from nocl.threads import one_thread
 from nocl.to_casadi import to_casadi
+from nocl.validation import HORIZONS, Validation, validate
 
-__all__ = ["LearnedDynamics", "PaperSettings", "Score", "Settings", "identify"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["LearnedDynamics", "LogSettings", "PaperSettings", "Score", "Settings", "identify"]
 
 METHODS = ("default", "mlp", "paper")
 KIND = "dynamics"
@@ -51,6 +60,7 @@ class LearnedDynamics:
     structure: str  # what was found, in words
     card: Mapping[str, Any] = field(default_factory=dict)  # how it was made: method, seed, settings, labels, score
     parts: Structure | None = None  # the structure itself; None for a network that learned everything
+    coverage: Coverage | None = None  # where the log has been that it was learned from
 
     def __call__(self, x: Tensor, u: Tensor) -> Tensor:
         return self.net(x, u)
@@ -59,8 +69,44 @@ class LearnedDynamics:
         """f:(x, u)->(xdot), native MX, equal to torch to rounding."""
         return to_casadi(self.net, name="f", in_names=["x", "u"], out_names=["xdot"])
 
+    def to_system(self) -> System:
+        """The system with f_theta for its equations, in its own symbols: for problems on a plant that is not known.
+
+        SX of all networks: for small ones, as logs teach them.
+        """
+        f, s = self.to_casadi().expand(), self.system
+        return replace(s, xdot=f(s.x, s.u))
+
+    def validate(self, log: Log, steps: Sequence[int] = HORIZONS, *, every: int | None = None) -> Validation:
+        """Errors of simulations of f_theta from a log's states, by number of steps: see nocl.validation."""
+        log.check(self.system)
+        return validate(self.net, log, steps, every, int(self.card.get("settings", {}).get("substeps", 1)))
+
+    def outside(self, x: ArrayLike, what: str | None = None) -> Any:
+        """Which states [N, nx] the model was not taught about, [N] bool; a UserWarning names `what`, where given.
+
+        For a model of a log, what is far from all logged states (nocl.coverage); else, what is outside the box X.
+        """
+        if self.coverage is not None:
+            return self.coverage.outside(x) if what is None else self.coverage.warn(x, what)
+        rows, _ = checks.states(x, self.system.nx, self.system.name, "x")
+        outside = ((rows < self.system.lbx) | (rows > self.system.ubx)).any(axis=1)
+        if what is not None and outside.any():
+            warnings.warn(f"{outside.sum()} of {len(rows)} {what} lie outside the box X of {self.system.name!r}, which "
+                          "the model was taught in: widen lbx, ubx", UserWarning, stacklevel=2)
+        return outside
+
+    def plot(self) -> Figure:
+        """f_theta, and the exact f where it is known, along each variable through the middle of the box."""
+        from nocl.sysid_figures import slices
+
+        return slices(self)
+
     def score(self, n: int = 2000, seed: Seed = 1_000_003) -> Score:
-        """Errors against the exact f at n fresh uniform samples of the box X x U."""
+        """Errors against the exact f at n fresh uniform samples of the box X x U; ValueError where f is not known."""
+        if self.system.xdot is None:
+            raise ValueError(f"score: the equations of {self.system.name!r} are not known, there is nothing to compare "
+                             "with: model.validate(log) has the errors of simulations on logs")
         return score_of(self.net, Dataset.sample(self.system, n, seed))
 
     def refine(self, states: ArrayLike, controls: ArrayLike, *, spread: float = 0.05, share: float = 0.7, seed: int = 0,
@@ -76,7 +122,9 @@ class LearnedDynamics:
     def save(self, folder: str | Path) -> Path:
         """Write folder/dynamics.safetensors: weights, maps, the system's equations and the card, as data."""
         parts = None if self.parts is None else _structure_data(self.parts)
-        card = {"system": self.system.to_data(), "structure": self.structure, "card": dict(self.card), "parts": parts}
+        coverage = None if self.coverage is None else self.coverage.to_data()
+        card = {"system": self.system.to_data(), "structure": self.structure, "card": dict(self.card), "parts": parts,
+                "coverage": coverage}
         known = {} if self.parts is None else {"linear": self.parts.linear, "exact": self.parts.exact}
         return store.save(folder, KIND, nets={"f": self.net}, functions=known, card=card)
 
@@ -86,7 +134,9 @@ class LearnedDynamics:
         record = store.load(folder, KIND)
         system = System.from_data(record.card["system"])
         parts = _structure_from(record.card["parts"], record.functions, box_of(system))
-        return LearnedDynamics(system, record.nets["f"].eval(), record.card["structure"], record.card["card"], parts)
+        coverage = record.card.get("coverage")
+        return LearnedDynamics(system, record.nets["f"].eval(), record.card["structure"], record.card["card"], parts,
+                               None if coverage is None else Coverage.from_data(coverage))
 
     def __repr__(self) -> str:
         nets = [net for net in self.net.nets if isinstance(net, MLP)]
@@ -96,21 +146,28 @@ class LearnedDynamics:
 
 
 @one_thread()
-def identify(system: System, *, data: Dataset | None = None, method: str = "default", gradients: bool = True,
-             seed: int = 0, settings: Settings | PaperSettings | None = None, progress: bool = True,
+def identify(system: System, *, data: Dataset | Log | None = None, method: str = "default", gradients: bool = True,
+             known: Known | None = None, control_affine: bool = False, seed: int = 0,
+             settings: Settings | PaperSettings | LogSettings | None = None, progress: bool = True,
              checkpoint: str | Path | None = None) -> LearnedDynamics:
-    """f_theta ~ f on the box X x U, learned from labels of f: values and, with `gradients`, Jacobians.
+    """f_theta ~ f on the box X x U, learned from labels of f (values and, with `gradients`, Jacobians) or from logs.
 
     Parameters
     ----------
     system : System
         Answers for labels at samples of its box; its equations are never read. With `data`, training takes names, boxes
-        and angles from it only; the score on the card always compares with its f.
-    data : Dataset
-        Labels to learn from instead; without Jacobians A, B, from values alone.
+        and angles from it only, and its equations may be unknown (xdot=None); where they are known, the score on the
+        card compares with them.
+    data : Dataset or Log
+        Labels to learn from instead; without Jacobians A, B, from values alone. A Log of trajectories is fitted by its
+        smoothed derivatives, then by simulation error (nocl.sysid_logs).
+    known : dict from states to their derivatives (SX, numbers, names of states or controls), or names of states
+        Equations that need not be learned; a bare name stands for the system's own equation.
+    control_affine : bool
+        xdot = a(x) + B(x) u. Labels of f with Jacobians show that by themselves.
     method : "default", "mlp" or "paper"
         Structure first; one plain sine network; the paper's network, loss and optimiser.
-    settings : Settings or (method "paper") PaperSettings
+    settings : Settings, (method "paper") PaperSettings or (logs) LogSettings
         Budgets and sizes.
     checkpoint : folder
         Finished networks are kept there, and not trained again when the same call is repeated ("paper": unused).
@@ -120,27 +177,61 @@ def identify(system: System, *, data: Dataset | None = None, method: str = "defa
     ValueError
         For settings, data or labels that cannot be used, with the remedy.
     """
-    settings = _check_arguments(system, method, settings, seed)
+    settings = _check_arguments(system, method, settings, seed, data)
+    stated, start, bar = Stated.of(system, known, control_affine), time.perf_counter(), Progress(system.name, progress)
+    if isinstance(data, Log):
+        assert isinstance(settings, LogSettings)
+        return _from_log(system, data, stated, settings, seed, bar)
+    assert not isinstance(settings, LogSettings)
     source = Source.of(system, data, gradients)
-    start = time.perf_counter()
-    bar = Progress(system.name, progress)
+    _check_stated(stated, method, source)
     if isinstance(settings, PaperSettings):
         net, parts = sysid_paper.train(source, settings, seed, bar), None
         words = "one network of all variables, as in the paper"
     else:
         if method == "mlp":
             settings = replace(settings, structure=False, angles=False)
-        parts = find_structure(source, settings, seed)
+        parts = find_structure(source, settings, seed, stated)
         weights = fit_groups(source, parts, settings, seed, bar, Checkpoint.at(checkpoint, system, seed, settings))
         net, words = assemble(parts, weights, settings.angles), parts.words
     card = {"method": method, "gradients": source.gradients, "seed": seed, "settings": asdict(settings),
             "labels": source.labels, "seconds": round(time.perf_counter() - start, 3), "torch": torch.__version__}
-    card["score"] = str(score_of(net, Dataset.sample(system, 2000, 1_000_003)))
+    card["score"] = _score_text(system, net)
     return LearnedDynamics(system, net, words, card, parts)
 
 
-def _check_arguments(system: System, method: str, settings: Settings | PaperSettings | None,
-                     seed: int) -> Settings | PaperSettings:
+def _score_text(system: System, net: FeatureNet) -> str:
+    if system.xdot is None:
+        return "not scored: the equations are not known"
+    return str(score_of(net, Dataset.sample(system, 2000, 1_000_003)))
+
+
+def _from_log(system: System, log: Log, stated: Stated, settings: LogSettings, seed: int,
+              bar: Progress) -> LearnedDynamics:
+    """f_theta from a log; the card's score is of simulations on that very log."""
+    log.check(system)
+    start = time.perf_counter()
+    parts = stated.plain(data_box(system, np.vstack([np.hstack([s, r.u]) for s, r in first_states(log)])))
+    net = fit_log(log, parts, settings, seed, bar)
+    seen = validate(net, log, (1, settings.window), substeps=settings.substeps)
+    errors = ", ".join(f"{100 * e:.3g} % after {k}" for k, e in zip(seen.steps, seen.relative, strict=True))
+    card = {"method": "log", "gradients": False, "seed": seed, "settings": asdict(settings), "labels": len(log),
+            "seconds": round(time.perf_counter() - start, 3), "torch": torch.__version__,
+            "score": f"simulation error on its own log, in units of the states' spread: {errors} steps"}
+    return LearnedDynamics(system, net, parts.words, card, parts, Coverage.of(log, system))
+
+
+def _check_stated(stated: Stated, method: str, source: Source) -> None:
+    if stated and method == "paper":
+        raise ValueError("identify: method 'paper' learns everything; expected no `known` and no `control_affine`: use "
+                         "the default method")
+    if stated.control_affine and source.data is not None:
+        raise ValueError("identify: control_affine is for labels that nocl draws, and for logs; got a Dataset: pass "
+                         "nocl.Log.of(system, t, x, u, xdot=...) of the trajectories instead")
+
+
+def _check_arguments(system: System, method: str, settings: Settings | PaperSettings | LogSettings | None, seed: int,
+                     data: Dataset | Log | None) -> Settings | PaperSettings | LogSettings:
     if not isinstance(system, System):
         raise ValueError(f"identify: system is a {type(system).__name__}; expected a nocl.System: "
                          "of an OCP, pass ocp.system")
@@ -148,7 +239,9 @@ def _check_arguments(system: System, method: str, settings: Settings | PaperSett
         raise ValueError(f"identify: method is {method!r}; expected one of {', '.join(METHODS)}")
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise ValueError(f"identify: seed is {seed!r}; expected an integer >= 0")
-    expected = PaperSettings if method == "paper" else Settings
+    if isinstance(data, Log) and method != "default":
+        raise ValueError(f"identify: method is {method!r}; logs take 'default' only: leave it out")
+    expected = LogSettings if isinstance(data, Log) else PaperSettings if method == "paper" else Settings
     if settings is None:
         return expected()
     if not isinstance(settings, expected):

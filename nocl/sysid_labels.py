@@ -10,6 +10,7 @@ import numpy as np
 from nocl import structure as structures
 from nocl.checks import Array
 from nocl.data import Dataset
+from nocl.known import Stated
 from nocl.structure import Box, Oracle, Structure
 from nocl.sysid_settings import Settings
 from nocl.system import System
@@ -37,7 +38,7 @@ class Source:
     def of(system: System, data: Dataset | None, gradients: bool) -> Source:
         if data is not None:
             z, value, gradient = _checked_data(system, data)
-            return Source(_data_box(system, z), gradients and gradient is not None, None,
+            return Source(data_box(system, z), gradients and gradient is not None, None,
                            (z, value, gradient if gradients else None), len(z))
         source = Source(box_of(system), gradients, None, None)
 
@@ -75,25 +76,34 @@ def _checked_data(system: System, data: Dataset) -> tuple[Array, Array, Array | 
     return np.hstack([arrays["x"], arrays["u"]]), arrays["xdot"], gradient
 
 
-def _data_box(system: System, z: Array) -> Box:
+def data_box(system: System, z: Array) -> Box:
     """The box that the data fill; the system's where they do not vary."""
     box, lb, ub = box_of(system), z.min(axis=0), z.max(axis=0)
     still = ub - lb <= 1e-9 * box.width
     return replace(box, lb=np.where(still, box.lb, lb), ub=np.where(still, box.ub, ub))
 
 
-def find_structure(source: Source, settings: Settings, seed: int) -> Structure:
+def find_structure(source: Source, settings: Settings, seed: int, stated: Stated) -> Structure:
+    """What the labels show, beside what is stated."""
     if not settings.structure:
-        return structures.plain(source.box)
+        return stated.plain(source.box)
     if not source.gradients:
-        return structures.plain(source.box, "without Jacobian labels no structure was looked for: "
-                                "one network of all variables")
+        return stated.plain(source.box, "without Jacobian labels no structure was looked for: "
+                                        "one network of all variables")
     if source.oracle is not None:
-        return structures.find(source.oracle, source.box, seed=seed, probes=settings.probes, features=settings.features)
-    assert source.data is not None
-    z, value, gradient = source.data
-    assert gradient is not None
-    return structures.read(z, value, gradient, source.box, features=settings.features)
+        left = stated.residual(source.oracle, source.box.nx)
+        found = structures.find(left, source.box, seed=seed, probes=settings.probes, features=settings.features)
+    else:
+        assert source.data is not None
+        z, value, gradient = source.data
+        assert gradient is not None
+        value, gradient = value.copy(), gradient.copy()
+        value[:, list(stated.rows)], gradient[:, list(stated.rows)] = 0.0, 0.0
+        found = structures.read(z, value, gradient, source.box, features=settings.features)
+    if not stated.rows:
+        return found
+    whole = stated.add(found)
+    return replace(whole, words=structures.describe(whole))
 
 
 @dataclass(frozen=True, eq=False)

@@ -64,6 +64,25 @@ class Settings:
 
 
 @dataclass(frozen=True)
+class LogSettings:
+    """Of identification from logged trajectories."""
+
+    width: int = 32  # of the two hidden layers
+    iterations: int = 300  # of L-BFGS on derivatives
+    steps: int = 20  # Gauss-Newton steps on simulation error, at most; 0: derivatives alone
+    window: int = 40  # samples that are simulated in one go
+    windows: int = 1000  # at most, drawn at random beyond
+    substeps: int = 1  # RK4 steps between two samples
+    ridge: float = 1e-6  # times the sum of squared weights, beside the mean of squared residuals
+    angles: bool = True  # networks see angles as sin and cos
+
+    def __post_init__(self) -> None:
+        _positive(self, ("width", "window", "windows", "substeps"), integer=True)
+        _positive(self, ("iterations", "steps"), integer=True, zero=True)
+        _positive(self, ("ridge",), zero=True)
+
+
+@dataclass(frozen=True)
 class PaperSettings:
     """Of method "paper": a three-layer MLP (two hidden layers), Adam, exponentially decaying rate."""
 
@@ -75,10 +94,11 @@ class PaperSettings:
     lr: float = 0.01
     final_lr: float = 1e-5
     samples: int = 200_000
+    frequency: float = 1.0  # inputs are normalised to this standard deviation; outputs to 1
 
     def __post_init__(self) -> None:
         _positive(self, ("width", "iterations", "batch", "samples"), integer=True)
-        _positive(self, ("lr", "final_lr"))
+        _positive(self, ("lr", "final_lr", "frequency"))
         if not isinstance(self.layers, int) or self.layers < 2:
             raise ValueError(f"PaperSettings: layers is {self.layers!r}; expected an integer >= 2")
         if self.activation not in ACTIVATIONS:
