@@ -1,6 +1,6 @@
 """The main job's stages in a run's folder, for the command line: each is made once, and taken up where it stands.
 
-dynamics/   the learned dynamics                              cnd/      controller and value function
+dynamics/   the learned dynamics                              cnd/      controller and value function, training.png
 export/     *.casadi, c/, c_float32/, parity.json             report/   report.html, rows.csv, summary.json, figures/
 checkpoint/ what an interrupted stage goes on from; gone once it is finished
 """
@@ -82,6 +82,7 @@ class Stages:
         cnd = train(self.ocp, model, seed=self.seed, settings=QUICK_TRAIN if self.quick else None, out=checkpoint)
         cnd.card[KEY] = made_from
         cnd.save(self.folder / "cnd")
+        cnd.plot_training(self.folder / "cnd" / "training.png")
         _forget(checkpoint)
         say(f"controller: done, {time.perf_counter() - start:.0f} s")
         return cnd

@@ -28,6 +28,7 @@ from nocl.solvers.cnd.labels import (
     tube,
 )
 from nocl.solvers.cnd.regress import fit, policy_loss
+from nocl.solvers.cnd.validate import advice, gap, refined, summary, value_scores
 from nocl.solvers.cnd.value import ROUND, ValueLabels, value_loss, value_net, value_solutions
 from nocl.solvers.ddp import DDP
 
@@ -168,6 +169,79 @@ def test_training_leaves_torch_as_it_was():
 @pytest.fixture(scope="module")
 def whole():
     return nocl.train(nocl.load_ocp("pendulum"), settings=TINY, seed=1, progress=False)
+
+
+def test_the_card_tells_how_training_went(whole, tmp_path):
+    rows, value = whole.card["history"], whole.card["value"]
+    assert [row["round"] for row in rows] == [0, 1, 2]
+    for row in rows:
+        assert {"labels", "loss", "gap_median", "gap_p95", "kicked_median", "kicked_p95"} <= set(row)
+        assert len(row["loss"]) == TINY.iterations * (2 if row["round"] == 2 else 1)
+    assert {"initial_error", "tails_error", "tails_degrees", "tails_slope_error", "hjb_mean"} <= set(value)
+    assert np.isfinite(list(value.values())[1:]).all()
+    assert json.loads(json.dumps(whole.card))["history"] == rows
+    picture = whole.plot_training(tmp_path / "run" / "training.png")
+    assert picture.read_bytes()[:8] == bytes([137]) + b"PNG\r\n" + bytes([26, 10])
+    with pytest.raises(ValueError, match="has no history; expected one of nocl"):
+        nocl.CND(whole.ocp, whole.policy).plot_training(tmp_path / "none.png")
+
+
+def test_the_papers_run_is_drawn_too(whole, tmp_path):
+    card = {"method": "paper", "history": {name: [1.0, 0.5, 0.2] for name in ("cost", "hjb", "final", "hamil")}}
+    assert nocl.CND(whole.ocp, whole.policy, None, card).plot_training(tmp_path / "paper.png").stat().st_size > 5000
+
+
+def test_a_large_gap_is_told_with_what_to_try():
+    with pytest.warns(UserWarning, match=r"costs .* % more than the optimum .* try TrainSettings with more rounds"):
+        nocl.train(nocl.load_ocp("double_integrator"), settings=replace(TINY, rounds=0, value=False), progress=False)
+    near = {"gap_median": 1e-4, "gap_p95": 1e-3}
+    assert advice(near, 2) is None
+    assert "more seeds" in advice({**near, "gap_p95": 0.5}, 2)
+
+
+def test_the_gap_counts_from_any_time_and_a_policy_that_blows_up_is_infinitely_bad(pendulum):
+    ocp, ddp, bank, f = pendulum
+    fine = DDP(ocp, intervals=160)
+    tails = refined(fine, tube(ddp, bank, 8, 0.1, np.random.default_rng(2)))
+    own = fine.solve(tails.x[:, 0], tails.t[:, 0], u=tails.u)
+    for i in range(3):  # the optimum's own feedback, as a policy of one row
+        K, t0, h = fine.intervals, tails.t[i, 0], (ocp.horizon - tails.t[i, 0]) / fine.intervals
+
+        def feedback(x, t, i=i, t0=t0, h=h, K=K):
+            k = np.clip(((t.numpy()[:, 0] - t0) / h + 1e-9).astype(int), 0, K - 1)
+            part = ((t.numpy()[:, 0] - t0) / h - k)[:, None]
+            near = (1 - part) * own.x[i, k] + part * own.x[i, k + 1]
+            u = own.u[i, k] + np.einsum("nij,nj->ni", own.gain[i, k], x.numpy() - near)
+            return torch.from_numpy(u.clip(ocp.system.lbu, ocp.system.ubu))
+
+        assert gap(ocp, feedback, f, own[i:i + 1]) == pytest.approx(0.0, abs=2e-3)
+    assert summary(np.array([np.nan, np.nan, 0.0]), "gap") == {"gap_median": np.inf, "gap_p95": np.inf}
+
+
+def test_value_scores_are_zero_for_the_exact_value():
+    """The double integrator's V = x' S(t) x from its own DDP solutions: errors of the label grid only."""
+    ocp = nocl.load_ocp("double_integrator")
+    fine, x0 = DDP(ocp, intervals=320), ocp.initial_states.sample(10, 5)
+    starts = fine.solve(x0)
+    x, t = ca.SX.sym("x", 2), ca.SX.sym("t")
+    s = ocp.horizon - t
+    W = ca.vertcat(ca.horzcat(s**3 / 3, s**2 / 2), ca.horzcat(s**2 / 2, s)) / 0.01
+    Phi = ca.vertcat(ca.horzcat(1, s), ca.horzcat(0, 1))
+    S = Phi.T @ ca.inv(ca.SX.eye(2) + W) @ Phi
+
+    def value(X, T):
+        return nocl.to_torch(ca.Function("V", [x, t], [x.T @ S @ x]))(X, T)
+
+    policy = nocl.to_torch(ca.Function("u", [x, t], [-(S[1, :] @ x) / 0.01]))
+    row = value_scores(ocp, value, policy, nocl.to_torch(ocp.system.f), starts, starts)
+    assert row["tails_error"] < 1e-4
+    assert row["tails_degrees"] < 0.1
+    assert row["tails_slope_error"] < 1e-4
+    assert row["hjb_mean"] < 1e-10
+    twice = value_scores(ocp, lambda X, T: 2 * value(X, T), policy, nocl.to_torch(ocp.system.f), starts, starts)
+    assert twice["initial_error"] == pytest.approx(1.0, abs=1e-3)
+    assert twice["initial_slope_error"] == pytest.approx(1.0, abs=1e-3)
+    assert twice["hjb_mean"] > 0.1
 
 
 @pytest.mark.parametrize("stage", ["_regress", "_value"])
