@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -32,13 +33,16 @@ def ddp_source(ocp: OCP, net: Any = None) -> str:
     """The generated part of the kernel: what csrc/ddp.h lists, for the exact f or for f_theta's FeatureNet."""
     x, u = ocp.system.x, ocp.system.u
     stage = _Stage(ocp, net)
-    sizes = {"N": x.numel(), "M": u.numel(), "NET": stage.net.numel(), "NJ": stage.J.nnz(), "NW": stage.W.nnz()}
-    lines = ['#include "lanes.h"', '#include "mlp.h"' if net else ""]
-    lines += [*(f"#define {name} {value}" for name, value in sizes.items()), _networks(ocp, net)]
-    lines += [emit("field", [x, u, stage.net], [ca.densify(stage.rhs)]),
-              emit("stage_jacobian", [x, u, stage.net], [stage.J]),
-              emit("stage_hessian", [x, u, stage.net, stage.mu], [stage.W]),
-              *_chain(x.numel(), u.numel(), stage.J.sparsity(), stage.W.sparsity())]
+    nets, networks = stage.nets, stage.networks
+    sizes = {"N": x.numel(), "M": u.numel(), "NET": networks.numel(), "TAPE": sum(n.tape for n in nets),
+             "NV": stage.v.numel(), "BEND": stage.bend.numel(), "NJ": stage.J.nnz(), "NW": stage.W.nnz()}
+    lines = ['#include "lanes.h"', *(['#include "mlp.h"'] if nets else []),
+             *(f"#define {name} {value}" for name, value in sizes.items()), _networks(x, u, nets),
+             emit("field", [x, u, networks], [ca.densify(stage.rhs)]),
+             emit("stage_jacobian", [x, u, networks], [stage.J]),
+             emit("network_weights", [x, u, networks, stage.mu], [stage.v]),
+             emit("stage_hessian", [x, u, networks, stage.bend, stage.mu], [stage.W]),
+             *_chain(x.numel(), u.numel(), stage.J.sparsity(), stage.W.sparsity())]
     G = ocp.terminal
     H, g = ca.hessian(G, x)
     lines.append(emit("terminal", [x], [ca.densify(G), ca.densify(g), ca.densify(H)]))
@@ -46,65 +50,61 @@ def ddp_source(ocp: OCP, net: Any = None) -> str:
     return "\n".join(lines)
 
 
+class _Net:
+    """One network as symbols: its values and slopes along q directions; its Hessian and adjoint for weights on the values.
+
+    The directions are the variables in z that its features depend on, or the features where those are fewer.
+    """
+
+    def __init__(self, mlp: Any, phi: ca.SX, z: ca.SX, number: int) -> None:
+        self.mlp, self.phi, out = mlp, ca.densify(phi), mlp.sizes[-1]
+        slopes = ca.jacobian(phi, z)
+        variables = sorted(set(slopes.sparsity().get_triplet()[1]))
+        few = len(variables) < phi.numel()
+        self.directions = z[variables] if few else phi
+        self.seeds = ca.densify(ca.jacobian(phi, z)[:, variables] if few else ca.SX.eye(phi.numel()))
+        self.q = q = self.directions.numel()
+        self.symbols = ca.SX.sym(f"net{number}", 1 + q, out)  # a column for each output: value, slopes
+        self.y, self.slopes = self.symbols[0, :].T, self.symbols[1:, :].T @ ca.jacobian(self.directions, z)
+        H, s = ca.SX.sym(f"H{number}", q * (q + 1) // 2), ca.SX.sym(f"s{number}", phi.numel())
+        self.bend = ca.vertcat(H, s)
+        along = ca.jacobian(self.directions, z)
+        through = ca.hessian(ca.dot(s, phi), z)[0]
+        self.hessian = along.T @ _symmetric(q, ca.vertsplit(H)) @ along + through  # of v'y in z, v fixed
+        self.tape = (q + 2) * sum(mlp.sizes[1:-1])
+        self.weights = sum((a + 1) * b for a, b in pairwise(mlp.sizes)) + (mlp.skip is not None) * phi.numel() * out
+
+
+def _symmetric(q: int, upper: Columns) -> ca.SX:
+    """A matrix from its upper triangle, row by row."""
+    H = ca.SX(q, q)
+    for (i, j), entry in zip(((i, j) for i in range(q) for j in range(i, q)), upper, strict=True):
+        H[i, j] = H[j, i] = entry
+    return H
+
+
 class _Stage:
     """(xdot, L) at a stage, its Jacobian and the weighted Hessian's lower triangle, with the networks as symbols."""
 
     def __init__(self, ocp: OCP, net: Any) -> None:
         x, u = ocp.system.x, ocp.system.u
-        z, n = ca.vertcat(x, u), x.numel() + 1
-        self.mu = ca.SX.sym("mu", n)
-        phi, y, Jy, Hy, self.net = _network_symbols(net, x, u)
-        xdot = ocp.system.equations if net is None else net.outputs(x, u, *y)
+        z, self.mu = ca.vertcat(x, u), ca.SX.sym("mu", x.numel() + 1)
+        phi = net.inputs.call([x, u]) if net is not None and net.nets else []
+        nets = zip(net.nets, phi, strict=True) if phi else ()
+        self.nets = [_Net(mlp, p, z, i) for i, (mlp, p) in enumerate(nets)]
+        self.networks = ca.vertcat(*(ca.vec(n.symbols) for n in self.nets))
+        self.bend = ca.vertcat(*(n.bend for n in self.nets))
+        xdot = ocp.system.xdot if net is None else net.outputs(x, u, *(n.y for n in self.nets))
         self.rhs = ca.vertcat(xdot, ocp.L_soft(x, u))
-        yz = ca.vertcat(*(J @ ca.jacobian(p, z) for J, p in zip(Jy, phi, strict=True)))
-        ys = ca.vertcat(*y)
-        self.J = ca.jacobian(self.rhs, z)
-        scalar = ca.dot(self.mu, self.rhs)
-        H = ca.hessian(scalar, z)[0]
-        if y:
-            self.J += ca.jacobian(self.rhs, ys) @ yz
-            v = ca.gradient(scalar, ys)
-            cross = ca.jacobian(ca.gradient(scalar, z), ys) @ yz
-            H = H + cross + cross.T + yz.T @ ca.hessian(scalar, ys)[0] @ yz
-            H += _through_features(v, phi, y, Jy, Hy, z)
-        self.W = ca.tril(H)
-
-
-def _network_symbols(net: Any, x: ca.SX, u: ca.SX) -> tuple[Columns, Columns, Columns, list[Columns], ca.SX]:
-    """(features, values, gradients [out, d], Hessians [d, d] of each output, all symbols as csrc/mlp.h orders them)."""
-    if net is None or not net.nets:
-        return [], [], [], [], ca.SX(0, 1)
-    phi = list(net.inputs.call([x, u]))
-    values, gradients, hessians, symbols = [], [], [], []
-    for g, p in enumerate(phi):
-        d, out = p.numel(), net.outputs.numel_in(2 + g)
-        block = ca.SX.sym(f"net{g}", 1 + d + d * (d + 1) // 2, out)
-        values.append(block[0, :].T)
-        gradients.append(block[1:1 + d, :].T)
-        upper = [[(i, j) for i in range(d) for j in range(i, d)]] * out
-        hessians.append([_symmetric(d, upper[o], ca.vertsplit(block[1 + d:, o])) for o in range(out)])
-        symbols.append(ca.vec(block))
-    return phi, values, gradients, hessians, ca.vertcat(*symbols)
-
-
-def _symmetric(d: int, places: list[tuple[int, int]], entries: list[ca.SX]) -> ca.SX:
-    H = ca.SX(d, d)
-    for (i, j), entry in zip(places, entries, strict=True):
-        H[i, j] = H[j, i] = entry
-    return H
-
-
-def _through_features(v: ca.SX, phi: Columns, y: Columns, Jy: Columns, Hy: list[Columns], z: ca.SX) -> ca.SX:
-    """Sum over network outputs of v_o d2 y_o / dz2, y_o a function of the features phi(z)."""
-    total, first = ca.SX(z.numel(), z.numel()), 0
-    for p, values, J, H in zip(phi, y, Jy, Hy, strict=True):
-        w = v[first:first + values.numel()]
-        first += values.numel()
-        pz = ca.jacobian(p, z)
-        total += pz.T @ sum(w[o] * H[o] for o in range(values.numel())) @ pz
-        s = ca.SX.sym("s", p.numel())
-        total += ca.substitute(ca.hessian(ca.dot(s, p), z)[0], s, J.T @ w)
-    return total
+        y, yz = ca.vertcat(*(n.y for n in self.nets)), ca.vertcat(*(n.slopes for n in self.nets))
+        self.J, scalar = ca.jacobian(self.rhs, z), ca.dot(self.mu, self.rhs)
+        H, self.v = ca.hessian(scalar, z)[0], ca.SX(0, 1)
+        if self.nets:
+            self.J += ca.jacobian(self.rhs, y) @ yz
+            Hyy, self.v = ca.hessian(scalar, y)
+            cross = ca.jacobian(ca.gradient(scalar, z), y) @ yz
+            H = H + cross + cross.T + yz.T @ Hyy @ yz + sum(n.hessian for n in self.nets)
+        self.v, self.W = ca.densify(self.v), ca.tril(H)
 
 
 def _chain(n: int, m: int, J_pattern: ca.Sparsity, W_pattern: ca.Sparsity) -> list[str]:
@@ -133,27 +133,39 @@ def _chain(n: int, m: int, J_pattern: ca.Sparsity, W_pattern: ca.Sparsity) -> li
             emit("step_derivatives", [Js, Ws, h], [ca.densify(F.T), ca.densify(cost), ca.densify(H)])]
 
 
-def _networks(ocp: OCP, net: Any) -> str:
-    """C of networks(): features by generated code, then each MLP."""
-    head = "static void networks(const double *weights, const lane *x, const lane *u, int order, lane *net)\n{\n"
-    if net is None or not net.nets:
-        return head + "    (void)weights; (void)x; (void)u; (void)order; (void)net;\n}\n"
-    x, u = ocp.system.x, ocp.system.u
-    lines, weight, first_phi, first_net = [], 1, 0, 0
-    for mlp in net.nets:
-        sizes, d = mlp.sizes, mlp.sizes[0]
-        full, widest = 1 + d + d * (d + 1) // 2, max(mlp.sizes)
-        skip = int(mlp.skip is not None)
-        lines.append(
-            f"    {{\n        static const int sizes[] = {{{', '.join(map(str, sizes))}}};\n"
-            f"        lane a[{widest * full}], y[{widest * full}];\n"
-            f"        const lane *out = mlp(weights + {weight}, sizes, {len(sizes) - 1}, "
-            f"{ACTIVATION_KINDS[mlp.activation]}, {skip}, order, phi + {first_phi}, a, y);\n"
-            f"        const int C = order ? {full} : 1;\n"
-            f"        for (int o = 0; o < {sizes[-1]}; ++o)\n"
-            f"            for (int c = 0; c < C; ++c) net[{first_net} + o * {full} + c] = out[o * C + c];\n    }}")
-        weight += sum((a + 1) * b for a, b in pairwise(sizes)) + skip * d * sizes[-1]
-        first_phi, first_net = first_phi + d, first_net + sizes[-1] * full
-    phi = [ca.densify(p) for p in net.inputs.call([x, u])]
-    features = emit("features", [x, u], [ca.vertcat(*phi)])
-    return features + head + f"    lane phi[{first_phi}];\n    features(x, u, phi);\n" + "\n".join(lines) + "\n}\n"
+def _networks(x: ca.SX, u: ca.SX, nets: Sequence[_Net]) -> str:
+    """C of network_values(), network_slopes() and network_bend(): features by generated code, then each MLP."""
+    values, slopes, bend = _Body(), _Body(), _Body()
+    emitted, weight, net, tape, v, bent = [], 1, 0, 0, 0, 0
+    for g, n in enumerate(nets):
+        d, C, sizes = n.phi.numel(), n.q + 1, n.mlp.sizes
+        emitted += [emit(f"features{g}", [x, u], [n.phi]),
+                    emit(f"seeds{g}", [x, u], [ca.vec(ca.horzcat(n.phi, n.seeds).T)])]
+        widest, skip = max(sizes), int(n.mlp.skip is not None)
+        shape = f"{{{', '.join(map(str, sizes))}}}"
+        common = f"weights + {weight}, (const int[]){shape}, {len(sizes) - 1}"
+        kind = ACTIVATION_KINDS[n.mlp.activation]
+        values.add(f"lane phi[{d}], a[{widest}], b[{widest}]; features{g}(x, u, phi);",
+                   f"mlp_values({common}, {kind}, {skip}, {C}, phi, a, b, net + {net});")
+        slopes.add(f"lane phi[{d * C}], a[{widest * C}], b[{widest * C}]; seeds{g}(x, u, phi);",
+                   f"mlp_slopes({common}, {kind}, {skip}, {C}, phi, tape + {tape}, a, b, net + {net});")
+        bend.add(f"lane a[{widest}], b[{widest}], work[{widest}], *H = bend + {bent};",
+                 f"mlp_bend({common}, {skip}, {n.q}, v + {v}, tape + {tape}, a, b, work, H, H + {n.bend.numel() - d});")
+        weight, net, tape = weight + n.weights, net + n.symbols.numel(), tape + n.tape
+        v, bent = v + sizes[-1], bent + n.bend.numel()
+    return "\n".join([*emitted, values.function("network_values", "const lane *x, const lane *u, lane *net"),
+                      slopes.function("network_slopes", "const lane *x, const lane *u, lane *net, lane *tape"),
+                      bend.function("network_bend", "const lane *v, const lane *tape, lane *bend")])
+
+
+class _Body:
+    """The blocks of a C function, one a network."""
+
+    def __init__(self) -> None:
+        self.blocks: list[str] = []
+
+    def add(self, *lines: str) -> None:
+        self.blocks.append("    {\n" + "".join(f"        {line}\n" for line in lines) + "    }\n")
+
+    def function(self, name: str, arguments: str) -> str:
+        return f"static void {name}(const double *weights, {arguments})\n{{\n{''.join(self.blocks)}}}\n"

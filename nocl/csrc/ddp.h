@@ -1,33 +1,32 @@
-/* Control-limited DDP over lanes. Generated before this file: N, M, the lengths NY (network values, 0 without), NET (their
-   values, gradients and Hessians), NJ, NW (nonzeros of a stage's Jacobian and Hessian), and
+/* Control-limited DDP over lanes. Generated before this file: N, M, the lengths NET (networks' values and slopes), TAPE (what
+   their adjoint pass needs), NV (their values), BEND (their Hessians and adjoints), all 0 without networks, NJ, NW (nonzeros
+   of a stage's Jacobian and Hessian), and
 
-   networks(weights, x, u, order, net)    net[NET]: values (order 0), and derivatives with respect to features (order 2)
-   field(x, u, net, out)                  out[N+1]: xdot, L
-   stage_jacobian(x, u, net, J)           nonzeros of d(xdot, L)/d(x, u)
-   stage_hessian(x, u, net, mu, W)        nonzeros of the Hessian of mu'(xdot, L)
-   stage_adjoints(J2, J3, J4, lam, h, mu) mu[4 (N+1)], what weights the four stages of a Runge-Kutta step
-   step_derivatives(J, W, h, F, l, H)     F[N NZ] = dx+/dz, l[NZ] = dcost/dz, H[NZ NZ] the Hessian of lam'x+ + cost
+   network_values(weights, x, u, net)         the values' places in net[NET]
+   network_slopes(weights, x, u, net, tape)   all of net[NET]
+   network_weights(x, u, net, mu, v)          v[NV] = d(mu'(xdot, L))/d(values)
+   network_bend(weights, v, tape, bend)       bend[BEND]
+   field(x, u, net, out)                      out[N+1]: xdot, L; reads only the networks' values
+   stage_jacobian(x, u, net, J)               nonzeros of d(xdot, L)/d(x, u)
+   stage_hessian(x, u, net, bend, mu, W)      nonzeros of the Hessian of mu'(xdot, L)
+   stage_adjoints(J2, J3, J4, lam, h, mu)     mu[4 (N+1)], what weights the four stages of a Runge-Kutta step
+   step_derivatives(J, W, h, F, l, H)         F[N NZ] = dx+/dz, l[NZ] = dcost/dz, H[NZ NZ] the Hessian of lam'x+ + cost
    terminal(x, G, Gx, Gxx)
 
    Arrays are problem-major, rows as numpy has them: x [B, K+1, N], u [B, K, M], gains [B, K, M, N]. */
 #define NZ (N + M)
 
-static void eval_field(const double *weights, const lane *x, const lane *u, lane *out)
-{
-    lane net[NET + 1];
-    networks(weights, x, u, 0, net);
-    field(x, u, net, out);
-}
+static const double reach[4] = {0, 0.5, 0.5, 1}, share[4] = {1. / 6, 1. / 3, 1. / 3, 1. / 6};
 
-/* One Runge-Kutta step with its stages' states s[4][N]; returns the cost of the step. */
-static lane step(const double *weights, const lane *x, const lane *u, lane h, lane s[4][N], lane *next)
+/* One Runge-Kutta step, x to next; returns its cost. */
+static lane step(const double *weights, const lane *x, const lane *u, lane h, lane *next)
 {
-    static const double reach[4] = {0, 0.5, 0.5, 1}, share[4] = {1. / 6, 1. / 3, 1. / 3, 1. / 6};
-    lane k[N + 1], cost = {0};
+    lane s[N], k[N + 1], net[NET + 1], cost = {0};
     for (int i = 0; i < N; ++i) next[i] = x[i];
     for (int j = 0; j < 4; ++j) {
-        for (int i = 0; i < N; ++i) s[j][i] = j ? x[i] + reach[j] * h * k[i] : x[i];
-        eval_field(weights, s[j], u, k);
+        for (int i = 0; i < N; ++i) s[i] = j ? x[i] + reach[j] * h * k[i] : x[i];
+        network_values(weights, s, u, net);
+        field(s, u, net, k);
         for (int i = 0; i < N; ++i) next[i] += share[j] * h * k[i];
         cost += share[j] * h * k[N];
     }
@@ -42,7 +41,7 @@ void nocl_rollout(int64_t first, int64_t last, const int64_t *index, int64_t K, 
 {
     for (int64_t b = first; b < last; ++b) {
         const int64_t *at = index + b * WIDTH;
-        lane x[N], u[M], s[4][N], next[N], G[1], Gx[N], Gxx[N * N], cost = {0};
+        lane x[N], u[M], next[N], G[1], Gx[N], Gxx[N * N], cost = {0};
         const lane h = gather(h_, at, 1, 0), a = gather(alpha, at, 1, 0);
         for (int i = 0; i < N; ++i) x[i] = gather(x0, at, N, i);
         for (int64_t t = 0; t < K; ++t) {
@@ -57,7 +56,7 @@ void nocl_rollout(int64_t first, int64_t last, const int64_t *index, int64_t K, 
                 u[j] = where(u[j] < splat(lb[j]), splat(lb[j]), where(u[j] > splat(ub[j]), splat(ub[j]), u[j]));
                 scatter(u_, at, K * M, t * M + j, u[j]);
             }
-            cost += step(weights, x, u, h, s, next);
+            cost += step(weights, x, u, h, next);
             for (int i = 0; i < N; ++i) x[i] = next[i];
         }
         for (int i = 0; i < N; ++i) scatter(x_, at, (K + 1) * N, K * N + i, x[i]);
@@ -179,17 +178,27 @@ static void feedback(lane L[M][M], lane Q[NZ][NZ], const mask *held, lane gain[M
     }
 }
 
-static void stage_terms(const double *weights, lane s[4][N], const lane *u, const lane *lam, lane h,
+/* The derivatives of one Runge-Kutta step from x, second ones along lam (see step_derivatives); returns its cost. */
+static lane derivatives(const double *weights, const lane *x, const lane *u, const lane *lam, lane h,
                         lane *F, lane *l, lane *H)
 {
-    lane net[4][NET + 1], J[4 * NJ], W[4 * NW + 1], mu[4 * (N + 1)];
+    lane s[4][N], k[N + 1], net[4][NET + 1], tape[4][TAPE + 1], v[NV + 1], bend[BEND + 1];
+    lane J[4 * NJ + 1], W[4 * NW + 1], mu[4 * (N + 1)], cost = {0};
     for (int j = 0; j < 4; ++j) {
-        networks(weights, s[j], u, 2, net[j]);
+        for (int i = 0; i < N; ++i) s[j][i] = j ? x[i] + reach[j] * h * k[i] : x[i];
+        network_slopes(weights, s[j], u, net[j], tape[j]);
+        field(s[j], u, net[j], k);
+        cost += share[j] * h * k[N];
         stage_jacobian(s[j], u, net[j], J + j * NJ);
     }
     stage_adjoints(J + NJ, J + 2 * NJ, J + 3 * NJ, lam, &h, mu);
-    for (int j = 0; j < 4; ++j) stage_hessian(s[j], u, net[j], mu + j * (N + 1), W + j * NW);
+    for (int j = 0; j < 4; ++j) {
+        network_weights(s[j], u, net[j], mu + j * (N + 1), v);
+        network_bend(weights, v, tape[j], bend);
+        stage_hessian(s[j], u, net[j], bend, mu + j * (N + 1), W + j * NW);
+    }
     step_derivatives(J, W, &h, F, l, H);
+    return cost;
 }
 
 /* Q = H + F' Vxx F, q = l + F' Vx. */
@@ -246,7 +255,7 @@ void nocl_backward(int64_t first, int64_t last, const int64_t *index, int64_t K,
 {
     for (int64_t b = first; b < last; ++b) {
         const int64_t *at = index + b * WIDTH;
-        lane x[N], u[M], s[4][N], next[N], V[1], Vx[N], Vxx[N * N], slope = {0}, curve = {0};
+        lane x[N], u[M], V[1], Vx[N], Vxx[N * N], slope = {0}, curve = {0};
         const lane h = gather(h_, at, 1, 0), reg = gather(mu_, at, 1, 0);
         mask positive = all_lanes();
         for (int i = 0; i < N; ++i) x[i] = gather(x_, at, (K + 1) * N, K * N + i);
@@ -260,8 +269,7 @@ void nocl_backward(int64_t first, int64_t last, const int64_t *index, int64_t K,
             mask held[M];
             for (int i = 0; i < N; ++i) x[i] = gather(x_, at, (K + 1) * N, (t - 1) * N + i);
             for (int j = 0; j < M; ++j) u[j] = gather(u_, at, K * M, (t - 1) * M + j);
-            V[0] += step(weights, x, u, h, s, next);
-            stage_terms(weights, s, u, Vx, h, F, l, H);
+            V[0] += derivatives(weights, x, u, Vx, h, F, l, H);
             action_value(F, l, H, Vx, Vxx, Q, q);
             for (int i = 0; i < M; ++i)
                 for (int j = 0; j < M; ++j) Quu[i][j] = Q[N + i][N + j] + (i == j ? reg : (lane){0});

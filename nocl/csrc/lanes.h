@@ -1,6 +1,9 @@
 /* Lanes: a vector of WIDTH doubles, one problem of the batch in each; the widest that this machine has. */
 #include <math.h>
 #include <stdint.h>
+#if defined(__AVX2__)
+#include <immintrin.h>
+#endif
 
 #if defined(__AVX512F__)
 #define WIDTH 8
@@ -25,7 +28,18 @@ static inline lane where(mask m, lane a, lane b) { return (lane)((m & bits(a)) |
 static inline lane truth(mask m) { return (lane)(m & bits(splat(1.0))); }
 static inline mask is_finite(lane x) { return (x - x) == (lane){0}; }
 static inline mask all_lanes(void) { return (lane){0} == (lane){0}; }
-static inline int any_lane(mask m) { int64_t any = 0; for (int i = 0; i < WIDTH; ++i) any |= m[i]; return any != 0; }
+static inline int any_lane(mask m)
+{
+#if defined(__AVX512DQ__)
+    return _mm512_movepi64_mask((__m512i)m) != 0;
+#elif defined(__AVX2__) && !defined(__AVX512F__)
+    return _mm256_movemask_pd((__m256d)m) != 0;
+#else
+    int64_t any = 0;
+    for (int i = 0; i < WIDTH; ++i) any |= m[i];
+    return any != 0;
+#endif
+}
 
 #define ONE_BY_ONE(name) static inline lane v_##name(lane x) { \
     lane y; for (int i = 0; i < WIDTH; ++i) y[i] = name(x[i]); return y; }
@@ -40,13 +54,15 @@ static inline int any_lane(mask m) { int64_t any = 0; for (int i = 0; i < WIDTH;
 #define AT_ONCE2 TWO_BY_TWO
 #endif
 
-AT_ONCE(sin) AT_ONCE(cos) AT_ONCE(tan) AT_ONCE(asin) AT_ONCE(acos) AT_ONCE(atan)
+AT_ONCE(tan) AT_ONCE(asin) AT_ONCE(acos) AT_ONCE(atan)
 AT_ONCE(sinh) AT_ONCE(cosh) AT_ONCE(tanh) AT_ONCE(asinh) AT_ONCE(acosh) AT_ONCE(atanh)
 AT_ONCE(exp) AT_ONCE(log) AT_ONCE(expm1) AT_ONCE(log1p) AT_ONCE(erf)
 AT_ONCE2(pow) AT_ONCE2(atan2) AT_ONCE2(hypot)
 ONE_BY_ONE(sqrt) ONE_BY_ONE(fabs) ONE_BY_ONE(floor) ONE_BY_ONE(ceil)
 TWO_BY_TWO(fmod) TWO_BY_TWO(remainder) TWO_BY_TWO(copysign) TWO_BY_TWO(fmin) TWO_BY_TWO(fmax)
 static inline lane v_sign(lane x) { return where(x != x, x, truth(x > 0) - truth(x < 0)); }
+
+#include "trig.h"
 
 /* Problem-major arrays [B, stride], read and written for the problems at[0..WIDTH-1]. */
 static inline lane gather(const double *array, const int64_t *at, int64_t stride, int64_t offset)
