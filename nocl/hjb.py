@@ -120,9 +120,9 @@ def hjb_residual(value: Map, dynamics: Map, L: Map, x: Tensor, u: Tensor, t: Ten
     return V_t + hamiltonian(dynamics, L, x, u, V_x)
 
 
-def terminal_residual(value: Map, G: Map, x: Tensor, T: float) -> Tensor:
-    """V(x, T) - G(x), [N, 1]: zero for the optimal V."""
-    return value(x, x.new_full((*x.shape[:-1], 1), T)) - G(x)
+def terminal_residual(value: Map, G: Map, x: Tensor, T: float | Tensor) -> Tensor:
+    """V(x, T) - G(x), [N, 1]: zero for the optimal V; T a number or a tensor of one."""
+    return value(x, torch.as_tensor(T, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], 1)) - G(x)
 
 
 def hamiltonian_gradient(value: Map, dynamics: Map, L: Map, x: Tensor, u: Tensor, t: Tensor) -> Tensor:
@@ -164,7 +164,7 @@ def path_losses(path: Rollout, policy: Map, value: Map, dynamics: Map, L: Map, G
     """The losses of CND on given trajectories; see `losses`."""
     B, K, nu = path.u.shape
     x, t = path.x[:, :-1].reshape(B * K, -1), path.t[:-1].repeat(B)[:, None]
-    x_T, T = path.x[:, -1], float(path.t[-1])
+    x_T, T = path.x[:, -1], path.t[-1]  # no number of it is asked: on a GPU that would wait
     cost = (path.running + G(x_T)).mean()
     if detach:
         x, x_T = x.detach(), x_T.detach()

@@ -14,7 +14,7 @@ from nocl import hjb
 from nocl.fused import FusedStep
 from nocl.integrate import rk4_cost
 from nocl.simulate import simulate
-from nocl.solvers.cnd.paper import PaperSettings, controller_net, train_paper, value_net
+from nocl.solvers.cnd.paper import PaperSettings, _side_by_side, _Trainer, controller_net, train_paper, value_net
 from nocl.systems import cartpole, double_integrator, dubins, quadrotor
 from nocl.to_casadi import to_casadi
 from nocl.to_torch import to_torch
@@ -82,6 +82,66 @@ def test_fused_steps_are_the_torch_steps_with_the_same_gradients(problem):
 
 def train(ocp, dynamics=None, seed=0, **settings):
     return train_paper(ocp, dynamics, PaperSettings(**settings), seed, progress=False)
+
+
+def test_interrupted_and_resumed_is_the_same_run(tmp_path):
+    ocp, path = double_integrator.ocp(), tmp_path / "run" / "training.safetensors"
+    settings = PaperSettings(**{**TINY, "iterations": 12})
+    *nets, card = train_paper(ocp, None, settings, progress=False)
+
+    def stop(k, terms):
+        if k == 7:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        train_paper(ocp, None, settings, progress=False, callback=stop, checkpoint=path)
+    asked = []
+    *again, resumed = train_paper(ocp, None, settings, progress=False, checkpoint=path,
+                                  callback=lambda k, terms: asked.append(k))
+    assert asked == [7, 8, 9, 10, 11]  # the eighth iteration was not kept
+    for a, b in zip(outputs(nets, ocp), outputs(again, ocp), strict=True):
+        assert torch.equal(a, b)
+    for name in ("history", "race", "best_iteration", "held_out_cost", "dynamics_evaluations"):
+        assert resumed[name] == card[name], name
+    other = train_paper(ocp, None, settings, seed=3, progress=False, checkpoint=path)  # its own run, from the start
+    assert torch.equal(outputs(other[:2], ocp)[0], outputs(train_paper(ocp, None, settings, 3, progress=False)[:2],
+                                                           ocp)[0])
+
+
+def test_patience_stops_a_run_that_no_longer_gains():
+    ocp = double_integrator.ocp()
+    *_, card = train(ocp, **{**TINY, "iterations": 40, "learning_rate": 1e-12, "patience": 3})
+    assert card["iterations"] == len(card["history"]["cost"]) <= 40
+    assert card["iterations"] - card["best_iteration"] == 3
+    with pytest.raises(ValueError, match="patience is 0; expected an integer >= 1, or None"):
+        PaperSettings(patience=0)
+
+
+def test_the_public_call_keeps_checkpoints(tmp_path):
+    ocp = double_integrator.ocp()
+    cnd = nocl.train(ocp, method="paper", settings=PaperSettings(**TINY), out=tmp_path, progress=False)
+    assert [p.name for p in tmp_path.iterdir()] == ["training.safetensors"]
+    again = nocl.train(ocp, method="paper", settings=PaperSettings(**TINY), out=tmp_path, progress=False)
+    x = ocp.initial_states.sample(4, 1)
+    assert np.array_equal(again(x), cnd(x))
+    assert cnd.plot_training(tmp_path / "run.png").stat().st_size > 5000
+
+
+@pytest.mark.parametrize("device", ["meta", pytest.param("cuda", marks=pytest.mark.skipif(
+    not torch.cuda.is_available(), reason="no CUDA device here"))])
+@pytest.mark.parametrize("options", [{}, {"hold": True}, {"detach": True, "time_input": True}])
+def test_every_tensor_follows_the_device(device, options):
+    """One loss and its gradient on another device than the CPU; on "meta" a tensor left behind raises."""
+    ocp = double_integrator.ocp()
+    trainer = _Trainer(ocp, None, PaperSettings(**TINY, **options), 0, False, device, torch.float32)
+    policy, value = trainer.starts[0], trainer.value
+    terms = trainer.losses(policy, value)
+    parameters = [*policy.parameters(), *value.parameters()]
+    gradients = torch.autograd.grad(terms.total(trainer.settings.weights), parameters, materialize_grads=True)
+    assert {g.device.type for g in gradients} == {device}
+    assert trainer.step is rk4_cost  # compiled steps are the CPU's
+    many, _ = _side_by_side(trainer.starts)
+    assert trainer.costs(many, trainer.states(2, 3), hold=True).device.type == device
 
 
 def outputs(nets, ocp):

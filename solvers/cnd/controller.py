@@ -118,15 +118,17 @@ class CND:
 
     def parts(self) -> list[Part]:
         """What is exported: policy, gain and closed loop, and value and value gradient where it has a value."""
-        s, policy, value, f = self.ocp.system, self.policy, self.value_net, to_torch(self.ocp.system.f)
+        s, policy, value = self.ocp.system, self.policy, self.value_net
         box = {"x": (s.lbx, s.ubx), "t": (0.0, self.ocp.horizon)}
         x, u = ({"x": [s.unit(n) for n in s.state_names]}, [s.unit(n) for n in s.control_names])
         slopes = [f"d {i} / d {j}" for i in s.control_names for j in s.state_names]
         made = [Part("policy", self.to_casadi(), policy, box | {"u": (s.lbu, s.ubu)}, x | {"u": u}, policy),
                 Part("gain", self.gain_to_casadi(), lambda x, t: _slopes(policy, x, t), box, x | {"K": slopes},
-                     lean=_lean(self.to_casadi(), "gain", "K")),
-                Part("closed_loop", self.closed_loop_to_casadi(), lambda x, t: f(x, policy(x, t)), box,
-                     x | {"xdot": [f"d {i} / dt" for i in s.state_names]})]
+                     lean=_lean(self.to_casadi(), "gain", "K"))]
+        if s.xdot is not None:  # a plant that is not known has no closed loop to write down
+            f = to_torch(s.f)
+            made.append(Part("closed_loop", self.closed_loop_to_casadi(), lambda x, t: f(x, policy(x, t)), box,
+                             x | {"xdot": [f"d {i} / dt" for i in s.state_names]}))
         if value is not None:
             made += [Part("value", self.value_to_casadi(), value, box, x | {"V": ["cost-to-go"]}, value),
                      Part("value_gradient", self.value_gradient_to_casadi(), lambda x, t: _slopes(value, x, t), box,

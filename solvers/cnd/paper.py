@@ -22,7 +22,8 @@ import copy
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -32,86 +33,20 @@ from torch import Tensor
 from torch.func import functional_call, stack_module_state
 from tqdm import tqdm
 
-from nocl import hjb
+from nocl import hjb, store
 from nocl.fused import FusedStep
-from nocl.integrate import rk4_cost
-from nocl.nets import ACTIVATIONS, MLP, FeatureNet
+from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
+from nocl.solvers.cnd.identity import identity
+from nocl.solvers.cnd.paper_settings import STEPS, PaperSettings
 from nocl.to_torch import to_torch
 
-STEPS: dict[str, hjb.Step] = {"rk4": rk4_cost, "euler": hjb.euler_cost}
+__all__ = ["PaperSettings", "train_paper"]
 TERMS = ("cost", "hjb", "final", "hamil")
 CHECKS = 40  # times that L_cost is measured on held-out initial states, the best networks kept
 HELD_OUT = 128  # initial states for that
 BAD_STEPS = 10  # updates in a row that may be skipped for a gradient that overflowed
 LAST = 20  # iterations that a race is judged by
-
-
-@dataclass(frozen=True)
-class PaperSettings:
-    """Settings of method="paper"; the defaults are the paper's wherever it says."""
-
-    hidden: Sequence[int] = (64, 64)  # widths of the controller's hidden layers
-    value_hidden: Sequence[int] = (64, 64)  # widths of the value function's
-    activation: str = "tanh"
-    time_input: bool = False  # True: u(x, t), which the optimum of a finite horizon needs; the paper has u(x)
-    sin_cos: bool = True  # sin and cos of declared angles as inputs, beside their values
-    intervals: int = 40  # K: steps of a rollout
-    step: str = "rk4"  # or "euler", as published
-    hold: bool = False  # False: feedback inside RK4's stages, as in a neural ODE; True: held over intervals
-    fused: bool = True  # held RK4 steps of the exact f as compiled C on the CPU; False: in torch, same gradients
-    iterations: int = 1000  # of Adam, after the race
-    batch: int = 64  # initial states an iteration
-    learning_rate: float = 0.01
-    decay: float = 0.01  # the learning rate falls exponentially, to this share of its start
-    weights: tuple[float, float, float, float] = (1.0, 1.0, 0.01, 0.01)  # of L_cost, L_HJB, L_final, L_hamil
-    clip: float | None = 1.0  # the gradient's norm, of u and of V each; None: not clipped
-    detach: bool = False  # True: L_HJB, L_final, L_hamil see the trajectory's states as constants
-    race: int = 8  # random initial controllers that start side by side; 1: no race
-    race_iterations: int = 200  # of L_cost alone, for each of them
-    race_batch: int = 16  # initial states an iteration, for each of them
-
-    def __post_init__(self) -> None:
-        for name in ("hidden", "value_hidden"):
-            widths = tuple(getattr(self, name))
-            if not widths or not all(_is_count(w) for w in widths):
-                raise ValueError(f"PaperSettings: {name} is {widths}; expected widths of hidden layers, like (64, 64)")
-            object.__setattr__(self, name, widths)
-        for name in ("intervals", "iterations", "batch", "race", "race_iterations", "race_batch"):
-            if not _is_count(getattr(self, name)):
-                raise ValueError(f"PaperSettings: {name} is {getattr(self, name)!r}; expected an integer >= 1")
-        self._check_numbers()
-        for name in ("time_input", "sin_cos", "hold", "fused", "detach"):
-            if not isinstance(getattr(self, name), bool):
-                raise ValueError(f"PaperSettings: {name} is {getattr(self, name)!r}; expected True or False")
-        if not self.hold and self.step != "rk4":
-            raise ValueError(f"PaperSettings: step is {self.step!r} with hold=False; expected step='rk4', which "
-                             "feedback in continuous time is integrated by")
-        for name, known in (("activation", ACTIVATIONS), ("step", STEPS)):
-            if getattr(self, name) not in known:
-                raise ValueError(f"PaperSettings: {name} is {getattr(self, name)!r}; expected {', '.join(known)}")
-
-    def _check_numbers(self) -> None:
-        for name in ("learning_rate", "decay", "clip"):
-            value = getattr(self, name)
-            if not (value is None and name == "clip") and not (_is_number(value) and value > 0):
-                raise ValueError(f"PaperSettings: {name} is {value!r}; expected a finite number > 0"
-                                 + (", or None for no clipping" if name == "clip" else ""))
-        if self.decay > 1:
-            raise ValueError(f"PaperSettings: decay is {self.decay!r}; expected at most 1, which is no decay")
-        weights: Any = tuple(self.weights) if isinstance(self.weights, (tuple, list)) else (self.weights,)
-        if len(weights) != 4 or not all(_is_number(w) and w >= 0 for w in weights) or weights[0] == 0:
-            raise ValueError(f"PaperSettings: weights is {weights}; expected four numbers >= 0, of L_cost (not 0), "
-                             "L_HJB, L_final, L_hamil: the paper's are (1, 1, 0.01, 0.01)")
-        object.__setattr__(self, "weights", weights)
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
-
-
-def _is_count(value: Any) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(value >= 1)
 
 
 def controller_net(ocp: OCP, settings: PaperSettings) -> FeatureNet:
@@ -145,7 +80,7 @@ def _features(ocp: OCP, t: ca.SX | None, sin_cos: bool) -> ca.SX:
 def train_paper(ocp: OCP, dynamics: Any = None, settings: PaperSettings | None = None, seed: int = 0, *,
                 progress: bool | None = True, device: str | torch.device = "cpu", dtype: torch.dtype = torch.float32,
                 callback: Callable[[int, Mapping[str, float]], None] | None = None,
-                ) -> tuple[FeatureNet, FeatureNet, dict[str, Any]]:
+                checkpoint: Path | None = None) -> tuple[FeatureNet, FeatureNet, dict[str, Any]]:
     """(controller u(x, t), value V(x, t), card) by the paper's method; both networks in float64 on the CPU.
 
     Parameters
@@ -154,19 +89,22 @@ def train_paper(ocp: OCP, dynamics: Any = None, settings: PaperSettings | None =
     seed : of initial networks and initial states; the caller's own generators are left alone
     progress : a bar with the loss terms and the time left; None: where the terminal is one
     callback : called as callback(iteration, terms) after each iteration of the joint training
+    checkpoint : a file that is written at each of 40 checks; the same call goes on from it, to the same result
 
     The card holds settings, seed, seconds, evaluations of the dynamics, the race and the terms' history: data only.
     Raises ValueError where training diverges, naming the iteration and what to try.
     """
     settings = settings or PaperSettings()
     trainer = _Trainer(ocp, dynamics, settings, seed, progress, device, dtype)
-    start = time.perf_counter()
-    policy, race = trainer.race()
-    raced = time.perf_counter()
-    policy, value, history = trainer.joint(policy, callback)
+    key = identity(ocp, settings, seed, trainer.f, dtype=str(dtype), dynamics=str(type(dynamics)))
+    run = _Run.resumed(trainer, checkpoint, key) or _Run.raced(trainer)
+    run.train(callback, None if checkpoint is None else lambda: run.save(checkpoint, key))
+    policy, value = run.best.networks(settings)
     card = {"method": "paper", "settings": asdict(settings), "seed": seed, "dtype": str(dtype).removeprefix("torch."),
-            "dynamics": "exact" if dynamics is None else "learned", "race": race, "race_seconds": raced - start,
-            "seconds": time.perf_counter() - start, "dynamics_evaluations": trainer.evaluations, **history}
+            "dynamics": "exact" if dynamics is None else "learned", "race": run.race, "race_seconds": run.race_seconds,
+            "seconds": run.seconds, "dynamics_evaluations": trainer.evaluations, "iterations": len(run.rows),
+            "history": {name: [row[i] for row in run.rows] for i, name in enumerate(TERMS)},
+            "best_iteration": run.best.iteration, "held_out_cost": run.best.cost}
     return policy.to("cpu", torch.float64).eval(), value.to("cpu", torch.float64).eval(), card
 
 
@@ -226,35 +164,6 @@ class _Trainer:
         winner.nets[0].load_state_dict({name: p.detach()[best] for name, p in parameters.items()})
         return winner, [float(v) for v in scores]
 
-    def joint(self, policy: FeatureNet, callback: Callable[[int, Mapping[str, float]], None] | None,
-              ) -> tuple[FeatureNet, FeatureNet, dict[str, Any]]:
-        """Controller and value after joint training by all four losses: those of the best check, and the history."""
-        s, value = self.settings, self.value
-        groups = [list(policy.parameters()), list(value.parameters())]
-        adam = torch.optim.Adam([p for group in groups for p in group], lr=s.learning_rate)
-        held_out, every = self.states(HELD_OUT), max(1, s.iterations // CHECKS)
-        best, rows, bad = _Best(), [], 0
-        for k in (bar := tqdm(range(s.iterations), f"CND on {self.ocp.system.name}", disable=self.hidden)):
-            terms = self.losses(policy, value)
-            gradients = torch.autograd.grad(terms.total(s.weights), groups[0] + groups[1], materialize_grads=True)
-            rows.append([float(v.detach()) for v in terms.terms()])
-            bad = 0 if _finite(rows[-1], gradients) else bad + 1
-            if bad >= BAD_STEPS:
-                raise ValueError(_diverged(k, rows[-1], s))
-            if not bad:
-                n, adam.param_groups[0]["lr"] = len(groups[0]), s.learning_rate * s.decay ** (k / s.iterations)
-                _step(adam, groups[0] + groups[1], [*_clip(gradients[:n], s.clip), *_clip(gradients[n:], s.clip)])
-            named = dict(zip(TERMS, rows[-1], strict=True))
-            bar.set_postfix({name: f"{v:.3g}" for name, v in named.items()}, refresh=False)
-            if callback is not None:
-                callback(k, named)
-            if (k + 1) % every == 0 or k + 1 == s.iterations:
-                with torch.no_grad():
-                    best.offer(float(self.costs(policy, held_out, s.hold).mean()), k + 1, policy, value)
-        history = {"history": {name: [row[i] for row in rows] for i, name in enumerate(TERMS)},
-                   "best_iteration": best.iteration, "held_out_cost": best.cost}
-        return *best.networks(s), history
-
     def losses(self, policy: FeatureNet, value: FeatureNet) -> hjb.Losses:
         """The four terms on fresh trajectories; those of weight 0 are not computed."""
         s = self.settings
@@ -269,18 +178,112 @@ class _Best:
     """The networks with the lowest cost on held-out initial states."""
 
     def __init__(self) -> None:
-        self.cost, self.iteration = math.inf, 0
+        self.cost, self.iteration, self.waited = math.inf, 0, 0
         self.pair: tuple[FeatureNet, FeatureNet] | None = None
 
     def offer(self, cost: float, iteration: int, policy: FeatureNet, value: FeatureNet) -> None:
+        self.waited += 1
         if cost < self.cost:
-            self.cost, self.iteration, self.pair = cost, iteration, copy.deepcopy((policy, value))
+            self.cost, self.iteration, self.waited = cost, iteration, 0
+            self.pair = copy.deepcopy((policy, value))
 
     def networks(self, settings: PaperSettings) -> tuple[FeatureNet, FeatureNet]:
         if self.pair is None:
             raise ValueError("training diverged: the controller has an infinite cost on held-out initial states at "
                              f"every check; expected a finite one: {_remedy(settings)}")
         return self.pair
+
+
+class _Run:
+    """The joint training, from the race's winner or from a checkpoint; what it holds is what a checkpoint keeps."""
+
+    def __init__(self, trainer: _Trainer, policy: FeatureNet, race: list[float], race_seconds: float) -> None:
+        self.trainer, self.policy, self.value = trainer, policy, trainer.value
+        self.race, self.race_seconds, self.seconds = race, race_seconds, race_seconds
+        self.groups = [list(policy.parameters()), list(self.value.parameters())]
+        self.adam = torch.optim.Adam([p for g in self.groups for p in g], lr=trainer.settings.learning_rate)
+        self.held_out = trainer.states(HELD_OUT)
+        self.best, self.bad = _Best(), 0
+        self.rows: list[list[float]] = []
+
+    @classmethod
+    def raced(cls, trainer: _Trainer) -> _Run:
+        start = time.perf_counter()
+        policy, race = trainer.race()
+        return cls(trainer, policy, race, time.perf_counter() - start)
+
+    def train(self, callback: Callable[[int, Mapping[str, float]], None] | None,
+              save: Callable[[], Any] | None) -> None:
+        """All iterations that are left."""
+        s, every = self.trainer.settings, max(1, self.trainer.settings.iterations // CHECKS)
+        before, start = self.seconds, time.perf_counter()
+        with tqdm(total=s.iterations, initial=len(self.rows), desc=f"CND on {self.trainer.ocp.system.name}",
+                  disable=self.trainer.hidden) as bar:
+            while len(self.rows) < s.iterations and not (s.patience and self.best.waited >= s.patience):
+                named = self.iteration()
+                bar.set_postfix({name: f"{v:.3g}" for name, v in named.items()}, refresh=False)
+                bar.update()
+                if callback is not None:
+                    callback(len(self.rows) - 1, named)
+                if len(self.rows) % every == 0 or len(self.rows) == s.iterations:
+                    self.check()
+                    self.seconds = before + time.perf_counter() - start
+                    if save is not None:
+                        save()
+
+    def iteration(self) -> dict[str, float]:
+        """One step of Adam on fresh trajectories; the four terms."""
+        s, k, n = self.trainer.settings, len(self.rows), len(self.groups[0])
+        terms = self.trainer.losses(self.policy, self.value)
+        parameters = self.groups[0] + self.groups[1]
+        gradients = torch.autograd.grad(terms.total(s.weights), parameters, materialize_grads=True)
+        self.rows.append([float(v.detach()) for v in terms.terms()])
+        self.bad = 0 if _finite(self.rows[-1], gradients) else self.bad + 1
+        if self.bad >= BAD_STEPS:
+            raise ValueError(_diverged(k, self.rows[-1], s))
+        if not self.bad:
+            self.adam.param_groups[0]["lr"] = s.learning_rate * s.decay ** (k / s.iterations)
+            _step(self.adam, parameters, [*_clip(gradients[:n], s.clip), *_clip(gradients[n:], s.clip)])
+        return dict(zip(TERMS, self.rows[-1], strict=True))
+
+    def check(self) -> None:
+        """The cost on held-out initial states; the best networks are kept."""
+        with torch.no_grad():
+            cost = float(self.trainer.costs(self.policy, self.held_out, self.trainer.settings.hold).mean())
+        self.best.offer(cost, len(self.rows), self.policy, self.value)
+
+    def save(self, path: Path, key: str) -> None:
+        """Everything that the rest of the run depends on."""
+        pair = None if self.best.pair is None else [net.state_dict() for net in self.best.pair]
+        state = {"policy": self.policy.state_dict(), "value": self.value.state_dict(), "adam": self.adam.state_dict(),
+                 "best": pair, "held_out": self.held_out, "rows": torch.tensor(self.rows, dtype=torch.float64),
+                 "generator": self.trainer.rng.bit_generator.state}
+        meta = {"identity": key, "race": self.race, "race_seconds": self.race_seconds, "seconds": self.seconds,
+                "bad": self.bad, "evaluations": self.trainer.evaluations,
+                "best": [self.best.cost, self.best.iteration, self.best.waited]}
+        store.save_checkpoint(path, state, meta)
+
+    @classmethod
+    def resumed(cls, trainer: _Trainer, path: Path | None, key: str) -> _Run | None:
+        """The run that a checkpoint of the same call holds; another call's is left aside and overwritten."""
+        if path is None or not path.exists():
+            return None
+        state, meta = store.load_checkpoint(path)
+        if meta.get("identity") != key:
+            return None
+        run = cls(trainer, trainer.starts[0], meta["race"], meta["race_seconds"])
+        run.policy.load_state_dict(state["policy"])
+        run.value.load_state_dict(state["value"])
+        run.adam.load_state_dict(state["adam"])
+        run.held_out = state["held_out"].to(trainer.device, trainer.dtype)
+        run.rows, run.bad, run.seconds = state["rows"].tolist(), meta["bad"], meta["seconds"]
+        run.best.cost, run.best.iteration, run.best.waited = meta["best"]
+        if state["best"] is not None:
+            run.best.pair = copy.deepcopy((run.policy, run.value))
+            for net, weights in zip(run.best.pair, state["best"], strict=True):
+                net.load_state_dict(weights)
+        trainer.rng.bit_generator.state, trainer.evaluations = state["generator"], meta["evaluations"]
+        return run
 
 
 def _torch_dynamics(ocp: OCP, dynamics: Any, device: str | torch.device, dtype: torch.dtype) -> hjb.Map:

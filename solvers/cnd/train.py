@@ -12,8 +12,6 @@ The default method regresses the controller on optimal answers, and never differ
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import time
 import warnings
@@ -31,9 +29,10 @@ from nocl import store
 from nocl.checks import Array
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
-from nocl.solvers.bank import SolutionBank, extend, solve_globally
+from nocl.solvers.bank import SolutionBank, extend
 from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.features import at_rate, policy_net
+from nocl.solvers.cnd.identity import identity
 from nocl.solvers.cnd.labels import Labels, at_other_rates, tube, visited
 from nocl.solvers.cnd.regress import fit, policy_loss
 from nocl.solvers.cnd.settings import TrainSettings
@@ -48,7 +47,7 @@ from nocl.solvers.cnd.validate import (
 )
 from nocl.solvers.cnd.value import ValueLabels, value_loss, value_net, value_solutions
 from nocl.solvers.ddp import DDP, DDPSolution
-from nocl.symbolic import to_data
+from nocl.solvers.global_search import solve_globally
 from nocl.threads import one_thread
 from nocl.to_torch import to_torch
 
@@ -78,7 +77,7 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
     seed : int
         The same seed gives the same controller on the same machine.
     out : folder, optional
-        Where checkpoints go: a call with the same arguments goes on from the last one. The default method only.
+        Where checkpoints go: a call with the same arguments goes on from the last one.
     progress : bool, optional
         Whether to show progress; by default where the terminal is one.
     """
@@ -87,7 +86,8 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
         from nocl.solvers.cnd.paper import PaperSettings, train_paper
 
         chosen = _expect(settings, PaperSettings)
-        policy, value, card = train_paper(ocp, dynamics, chosen, seed=seed, progress=progress)
+        checkpoint = None if out is None else Path(out) / CHECKPOINT
+        policy, value, card = train_paper(ocp, dynamics, chosen, seed=seed, progress=progress, checkpoint=checkpoint)
         return CND(ocp, policy, value, card)
     if method != "default":
         raise ValueError(f"train: method is {method!r}; expected 'default' or 'paper'")
@@ -267,8 +267,7 @@ class _Training:
         return np.random.default_rng([self.seed, stage, STREAM])
 
     def _identity(self) -> str:
-        """What a checkpoint must have been made for."""
-        return json.dumps([self.ocp.to_data(), asdict(self.settings), self.seed, _fingerprint(self.f)], sort_keys=True)
+        return identity(self.ocp, self.settings, self.seed, self.f)
 
     def _save(self) -> None:
         if self.checkpoint is None:
@@ -318,17 +317,6 @@ def _seeded(seed: int) -> Iterator[None]:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         yield
-
-
-def _fingerprint(f: Any) -> str:
-    """What tells one model from another: the SHA-256 of a FeatureNet's maps and weights; "exact" for the exact f."""
-    net = getattr(f, "net", None)
-    if net is None:
-        return "exact"
-    sha = hashlib.sha256(json.dumps([to_data(net.inputs), to_data(net.outputs)]).encode())
-    for parameter in net.parameters():
-        sha.update(parameter.detach().double().cpu().numpy().tobytes())
-    return sha.hexdigest()
 
 
 def _tensors(arrays: dict[str, Any]) -> dict[str, torch.Tensor]:
