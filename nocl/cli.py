@@ -78,8 +78,10 @@ def parser() -> argparse.ArgumentParser:
     command("list", _list, "the problems that come with nocl")
     sub = command("run", _run, "identify, train, export, solve by NMPC, compare and report, in one go")
     _add(sub, "problem", "out", "seed", "n", "exact", "quick", "intervals", "methods")
-    sub = command("identify", _identify, "learn the dynamics")
+    sub = command("identify", _identify, "learn the dynamics, from the equations or from logged trajectories")
     _add(sub, "problem", "out", "seed", "quick")
+    sub.add_argument("--data", type=Path, metavar="LOG", help="a .csv or .parquet file with columns t, states, "
+                     "controls, and run: learn from it alone, test on a fifth of its runs")
     sub = command("train", _train, "train a controller and a value function, on learned dynamics unless --exact")
     _add(sub, "problem", "out", "seed", "exact", "quick")
     sub = command("solve", _solve, "solve the problem from many initial states")
@@ -231,7 +233,10 @@ def _identify(args: argparse.Namespace) -> None:
     ocp, out = _problem(args)
     stages = Stages(ocp, out, args.seed, args.quick)
     stages.check(exact=False)
-    stages.identify()
+    if args.data is None:
+        stages.identify()
+    else:
+        stages.identify_log(args.data)
 
 
 def _train(args: argparse.Namespace) -> None:

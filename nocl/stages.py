@@ -22,11 +22,13 @@ import numpy as np
 
 from nocl import __version__, store
 from nocl.checks import Array
+from nocl.logs import Log
 from nocl.ocp import OCP
 from nocl.solvers.cnd import CND, TrainSettings, train
-from nocl.sysid import LearnedDynamics, Settings, identify
+from nocl.sysid import LearnedDynamics, LogSettings, Settings, identify
 
 QUICK_IDENTIFY = Settings(iterations=300, polish=10)
+QUICK_LOG = LogSettings(width=16, iterations=100, steps=4)
 QUICK_TRAIN = TrainSettings(seeds=6, starts=6, states=60, tails=300, visits=200, rounds=1, iterations=400,
                             value_tails=400, value_iterations=300, held_out=16)
 PARTS = ("dynamics", "cnd", "export", "report", "checkpoint")  # folders in a run's folder
@@ -55,7 +57,7 @@ class Stages:
     def identify(self) -> LearnedDynamics:
         """The learned dynamics, in dynamics/."""
         made_from, there = self._made_from(), self._dynamics_there()
-        if there is not None and there.card.get(KEY) == made_from:
+        if there is not None and (there.card[KEY] == made_from or _of_a_log(there, made_from)):
             say(f"dynamics: taken from {self.folder / 'dynamics'} ({there.card.get('score', '')})")
             return there
         say(f"dynamics: learning f of {self.ocp.system.name}" + _anew(there))
@@ -69,10 +71,34 @@ class Stages:
         say(f"dynamics: {model.card.get('score', 'done')}, {time.perf_counter() - start:.0f} s")
         return model
 
+    def identify_log(self, path: Path) -> LearnedDynamics:
+        """The dynamics learned from a log, in dynamics/; their errors on a fifth of its recordings are shown first."""
+        log = Log.read(path, self.ocp.system)
+        made_from, there = self._made_from(data=hashlib.sha256(path.read_bytes()).hexdigest()), self._dynamics_there()
+        if there is not None and there.card[KEY] == made_from:
+            say(f"dynamics: taken from {self.folder / 'dynamics'} ({there.card['score']})")
+            return there
+        say(f"dynamics: {log!r}" + _anew(there))
+        settings = QUICK_LOG if self.quick else None
+        start = time.perf_counter()
+        model = identify(self.ocp.system, data=log, seed=self.seed, settings=settings)
+        if len({r.run for r in log}) > 1:
+            train, test = log.split(seed=self.seed)
+            held = identify(self.ocp.system, data=train, seed=self.seed, settings=settings)
+            say(f"learned from four fifths of the recordings, simulated on the others:\n{held.validate(test)}")
+        outside = int(model.outside(fresh_states(self.ocp, 100, self.seed)).sum())
+        if outside:
+            say(f"{outside} of 100 initial states of the problem lie outside the log: the model guesses there")
+        model = replace(model, card={**model.card, KEY: made_from})
+        model.save(self.folder / "dynamics")
+        say(f"dynamics: {model.card['score']}, {time.perf_counter() - start:.0f} s, in {self.folder / 'dynamics'}")
+        return model
+
     def train(self, exact: bool) -> CND:
         """The controller and value function, in cnd/; on dynamics/ unless exact."""
         model = None if exact else self.identify()
-        made_from, there = self._made_from(exact=exact), self._cnd_there()
+        data = {} if model is None else {k: v for k, v in model.card[KEY].items() if k == "data"}
+        made_from, there = self._made_from(exact=exact, **data), self._cnd_there()
         if there is not None and there.card.get(KEY) == made_from:
             say(f"controller: taken from {self.folder / 'cnd'}")
             return there
@@ -151,6 +177,11 @@ def _ours(thing: Any, folder: Path) -> Any:
         raise ValueError(f"{folder} holds what `nocl run` did not make, and would be overwritten; expected a folder of "
                          "a run: name another --out")
     return thing
+
+
+def _of_a_log(model: LearnedDynamics, made_from: dict[str, Any]) -> bool:
+    """Whether a model was learned from a log for the same problem: it stays, until another log is given."""
+    return "data" in model.card[KEY] and model.card[KEY]["problem"] == made_from["problem"]
 
 
 def _anew(there: Any) -> str:

@@ -7,6 +7,7 @@ import torch
 from scipy.linalg import expm
 
 import nocl
+from nocl.cli import main
 from nocl.coverage import Coverage
 from nocl.logs import Log
 from nocl.smoothing import dataset, noise, smooth
@@ -271,3 +272,30 @@ def test_known_rows_beside_labels():
     found = identify(s, known={"p": s.x[1]}, settings=nocl.sysid.Settings(iterations=5, polish=1, samples=4000),
                      progress=False)
     assert "d p/dt = v exact" in found.structure
+
+
+# the command line
+
+PLANT = """import casadi as ca
+import nocl
+
+p, v, u = ca.SX.sym("p"), ca.SX.sym("v"), ca.SX.sym("u")
+plant = nocl.System("plant", x=ca.vertcat(p, v), u=u, xdot=None, lbu=[-2], ubu=[2], lbx=[-2, -4], ubx=[2, 4])
+ocp = nocl.OCP.quadratic(plant, horizon=2.0, x_goal=[0, 0], u_goal=[0], R=0.1,
+                         initial_states=nocl.Gaussian(mean=[0.5, 0], std=[0.1, 0.1]))
+"""
+
+
+def test_identify_from_a_file(tmp_path, capsys):
+    file = write(tmp_path / "plant.py", PLANT)
+    data = linear_log(oscillator(), 0.02, runs=3, K=50).write(tmp_path / "log.csv")
+    command = ["identify", str(file), "--data", str(data), "--out", str(tmp_path / "run"), "--quick"]
+    assert main(command) == 0
+    out = capsys.readouterr().out
+    assert "3 pieces of 3 recordings" in out
+    assert "standing still" in out
+    assert LearnedDynamics.load(tmp_path / "run" / "dynamics").system.xdot is None
+    assert main(command) == 0
+    assert "dynamics: taken from" in capsys.readouterr().out
+    assert main(["identify", str(file), "--out", str(tmp_path / "other")]) == 2
+    assert "equations of 'plant' are not known" in capsys.readouterr().err
