@@ -1,0 +1,86 @@
+"""The simulation error: its sensitivities, its Gauss-Newton step, windows with holes."""
+
+import numpy as np
+import pytest
+import torch
+
+from nocl.known import Stated
+from nocl.logs import Log
+from nocl.shooting import Windows, _Problem, fit_simulation
+from nocl.smoothing import smooth
+from nocl.sysid_labels import box_of
+from nocl.sysid_logs import initial
+from nocl.sysid_networks import assemble
+from nocl.sysid_settings import LogSettings
+from nocl.systems import pendulum
+
+SMALL = LogSettings(width=3, window=4)
+
+
+def problem(substeps: int = 1, ridge: float = 0.0, n: int = 12) -> _Problem:
+    """A small random network on a short log with a hole and a window that is cut off."""
+    system, rng = pendulum.system(), np.random.default_rng(0)
+    x = np.column_stack([np.sin(0.3 * np.arange(n)), np.cos(0.3 * np.arange(n))]) + 0.1 * rng.standard_normal((n, 2))
+    x[5, 1] = np.nan
+    log = Log.of(system, 0.1 * np.arange(n), x, rng.uniform(-1, 1, (n, 1)))
+    parts = Stated.of(system, None, False).plain(box_of(system))
+    weights = initial(parts, SMALL, 0)
+    weights[0][2] = torch.from_numpy(0.3 * rng.standard_normal(weights[0][2].shape))
+    net = assemble(parts, weights, True)
+    unit = torch.from_numpy(rng.uniform(0.5, 2.0, sum(p.numel() for p in net.parameters())))
+    windows = Windows.of(log, [smooth(r) for r in log], 4, 100, rng)
+    return _Problem(net, unit, windows, substeps, ridge)
+
+
+def theta_of(p: _Problem) -> torch.Tensor:
+    return torch.nn.utils.parameters_to_vector(p.net.parameters()).detach() / p.unit
+
+
+@pytest.mark.parametrize("substeps", [1, 2])
+def test_sensitivities_are_autograds(substeps):
+    p = problem(substeps)
+    theta, w = theta_of(p), p.windows
+    R, D, r = p.sensitivities(theta, w, w.start)
+
+    def residuals(theta, start):
+        return w.residuals(p.f(theta), start, substeps).reshape(len(w), -1)
+
+    torch.testing.assert_close(r, residuals(theta, w.start), atol=1e-10, rtol=1e-10)
+    by_theta, by_start = torch.autograd.functional.jacobian(residuals, (theta, w.start))
+    torch.testing.assert_close(R, by_theta, atol=1e-9, rtol=1e-9)
+    own = torch.stack([by_start[i, :, i] for i in range(len(w))])
+    torch.testing.assert_close(D, own, atol=1e-9, rtol=1e-9)
+
+
+def test_the_projected_step_is_the_whole_least_squares_step():
+    p = problem()
+    theta, w = theta_of(p), p.windows
+    JJ, Jr, a, A = p.normal(theta, w.start)
+    R, D, r = p.sensitivities(theta, w, w.start)
+    W, rows, nx = D.shape
+    whole = torch.zeros(W * rows, len(theta) + W * nx, dtype=torch.float64)
+    whole[:, : len(theta)] = R.reshape(W * rows, -1)
+    for i in range(W):
+        whole[i * rows: (i + 1) * rows, len(theta) + i * nx: len(theta) + (i + 1) * nx] = D[i]
+    damp = 1e-3  # of theta alone
+    damped = whole.T @ whole / p.count
+    damped[: len(theta), : len(theta)] += damp * torch.eye(len(theta))
+    expected = -torch.linalg.solve(damped, whole.T @ r.reshape(-1) / p.count)
+    step = -torch.linalg.solve(JJ + damp * torch.eye(len(theta)), Jr)
+    torch.testing.assert_close(step, expected[: len(theta)], atol=1e-8, rtol=1e-6)
+    torch.testing.assert_close((a + A @ step).reshape(-1), expected[len(theta):], atol=1e-8, rtol=1e-6)
+
+
+def test_windows_hold_every_sample_and_count_holes_out():
+    w = problem(n=12).windows
+    assert w.u.shape == (3, 4, 1)
+    assert float(w.there.sum()) == 2 * (12 + 2) - 1  # the windows share two samples, one value is missing
+    assert w.h[2].ravel().tolist() == pytest.approx([0.1, 0.1, 0.1, 0.0])
+
+
+def test_each_step_lowers_the_error():
+    p, seen = problem(ridge=1e-6), []
+    before = p.loss(theta_of(p), p.windows.start) ** 0.5
+    fit_simulation(p.net, p.unit.numpy(), p.windows, steps=8, substeps=1, ridge=1e-6, report=seen.append)
+    assert seen == sorted(seen, reverse=True)
+    assert seen[-1] < 0.8 * before
