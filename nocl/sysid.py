@@ -156,8 +156,8 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
     ----------
     system : System
         Answers for labels at samples of its box; its equations are never read. With `data`, training takes names, boxes
-        and angles from it only, and its equations may be unknown (xdot=None); where they are known, the score on the
-        card compares with them.
+        and angles from it only, and its equations may be unknown (xdot=None). The score on the card compares with
+        them where they are known; for a Log, it is of simulations on that log.
     data : Dataset or Log
         Labels to learn from instead; without Jacobians A, B, from values alone. A Log of trajectories is fitted by its
         smoothed derivatives, then by simulation error (nocl.sysid_logs).
