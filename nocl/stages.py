@@ -30,7 +30,7 @@ from nocl.sysid import LearnedDynamics, LogSettings, Settings, identify
 QUICK_IDENTIFY = Settings(iterations=300, polish=10)
 QUICK_LOG = LogSettings(width=16, iterations=100, steps=4)
 QUICK_TRAIN = TrainSettings(seeds=6, starts=6, states=60, tails=300, visits=200, rounds=1, iterations=400,
-                            value_tails=400, value_iterations=300, held_out=16)
+                            value_tails=400, value_visits=200, value_iterations=300, held_out=16)
 PARTS = ("dynamics", "cnd", "export", "report", "checkpoint")  # folders in a run's folder
 REFINED = 4  # intervals of the comparison's reference for one of NMPC's
 KEY = "run"  # of a card: what the stage was made from

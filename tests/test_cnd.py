@@ -123,6 +123,19 @@ def test_save_and_load_bit_by_bit(cnd, tmp_path):
     assert repr(again) == repr(cnd)
 
 
+def test_rounded_weights_make_half_the_file(cnd, tmp_path):
+    small = cnd.rounded()
+    x, t = states(cnd)
+    assert small(x, t) == pytest.approx(cnd(x, t), abs=0.02)
+    assert not np.array_equal(small.value(x, t), cnd.value(x, t))
+    files = [c.save(tmp_path / name).stat().st_size for name, c in (("small", small), ("whole", cnd))]
+    weights = sum(p.numel() for net in (cnd.policy, cnd.value_net) for p in net.parameters())
+    assert files[1] - files[0] == pytest.approx(2 * weights, abs=100)
+    again = CND.load(tmp_path / "small")
+    assert np.array_equal(again(x, t), small(x, t))
+    assert np.array_equal(again.value(x, t), small.value(x, t))
+
+
 def test_without_a_value_it_says_so(cnd, tmp_path):
     CND(cnd.ocp, cnd.policy).save(tmp_path)
     bare = CND.load(tmp_path)

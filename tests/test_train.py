@@ -15,7 +15,7 @@ from nocl.integrate import rk4_interval
 from nocl.nets import MLP, FeatureNet
 from nocl.simulate import simulate
 from nocl.solvers import NMPC
-from nocl.solvers.bank import SolutionBank, extend, solve_globally
+from nocl.solvers.bank import SolutionBank, extend
 from nocl.solvers.cnd import TrainSettings
 from nocl.solvers.cnd.features import policy_net
 from nocl.solvers.cnd.labels import (
@@ -31,13 +31,15 @@ from nocl.solvers.cnd.regress import fit, policy_loss
 from nocl.solvers.cnd.validate import advice, gap, refined, summary, value_scores
 from nocl.solvers.cnd.value import ROUND, ValueLabels, value_loss, value_net, value_solutions
 from nocl.solvers.ddp import DDP
+from nocl.solvers.global_search import solve_globally
 
 module = importlib.import_module("nocl.solvers.cnd.train")  # the package has a function of that name
 
 QUICK = TrainSettings(intervals=40, seeds=4, starts=2, states=60, tails=400, visits=200, rounds=0, iterations=800,
-                      batch=512, hidden=(24, 24), value_tails=800, value_iterations=800, held_out=16, gap_median=1e-9)
+                      batch=512, hidden=(24, 24), value_tails=800, value_visits=200, value_iterations=800, held_out=16,
+                      gap_median=1e-9)
 TINY = replace(QUICK, intervals=20, batch=64, states=10, tails=40, visits=20, rounds=2, iterations=30, hidden=(8,),
-               value_tails=40, value_iterations=20, held_out=4)
+               value_tails=40, value_visits=10, value_iterations=20, held_out=4)
 
 
 def riccati(t, T=2.0, R=0.01):
@@ -444,7 +446,8 @@ def test_policy_loss_counts_what_costs():
 def test_value_labels_are_costs_to_go_on_the_fine_grid(pendulum):
     ocp, ddp, bank, f = pendulum
     fine = DDP(ocp, intervals=160)
-    whole, tails = value_solutions(ddp, fine, bank, feedback(ocp), f, 12, 0.25, np.random.default_rng(0))
+    whole, tails = value_solutions(ddp, fine, bank, feedback(ocp), f, tails=12, visits=8, width=0.25, kick=0.1,
+                                   rng=np.random.default_rng(0))
     assert len(whole) == len(bank)
     assert (whole.cost <= bank.solution.cost).all()  # what is held for shorter costs less
     labels = ValueLabels.of([whole, tails])

@@ -157,6 +157,13 @@ class CND:
 
         return export(self, folder, to, **options)
 
+    def rounded(self) -> CND:
+        """A copy with every weight rounded to 11 significant bits, whose file is half as large: score it anew."""
+        nets = [copy.deepcopy(n) for n in (self._at_rates or self.policy, self.value_net) if n is not None]
+        for p in (p for net in nets for p in net.parameters()):
+            p.copy_(p.half())
+        return CND(self.ocp, nets[0], nets[1] if self.value_net is not None else None, self.card)
+
     def plot_training(self, path: str | os.PathLike[str]) -> Path:
         """A picture of how it was trained, as a png at `path`: losses, and the gap on held-out states by round."""
         from nocl.solvers.cnd.plot import plot_training
@@ -166,7 +173,7 @@ class CND:
     def save(self, folder: str | os.PathLike[str]) -> Path:
         """Write controller, value, problem and card as one data-only file in `folder`."""
         policy = self.policy if self._at_rates is None else self._at_rates
-        nets = {"policy": _single(policy)} | ({} if self.value_net is None else {"value": _single(self.value_net)})
+        nets = {"policy": _smallest(policy)} | ({} if self.value_net is None else {"value": _smallest(self.value_net)})
         return store.save(Path(folder), KIND, nets=nets, card={"ocp": self.ocp.to_data(), "card": self.card})
 
     @classmethod
@@ -220,10 +227,12 @@ def _lean(f: ca.Function, name: str, out: str) -> ca.Function:
     return ca.Function(name, [x, t], [ca.vec(ca.densify(ca.horzcat(*columns)).T)], ["x", "t"], [out])
 
 
-def _single(net: FeatureNet) -> FeatureNet:
-    """The same numbers in half the bytes, where single precision holds every weight exactly (as after training)."""
-    exact = all(bool((p == p.float().double()).all()) for p in net.parameters())
-    return copy.deepcopy(net).float() if exact else net
+def _smallest(net: FeatureNet) -> FeatureNet:
+    """The same numbers in half the bytes, or a quarter, where fewer bits hold every weight exactly (`CND.rounded`)."""
+    for dtype in (torch.float16, torch.float32):
+        if all(bool((p == p.to(dtype).double()).all()) for p in net.parameters()):
+            return copy.deepcopy(net).to(dtype)
+    return net
 
 
 def pretrained(name: str, dynamics: str = "exact") -> CND:

@@ -25,8 +25,9 @@ class TrainSettings:
     hidden: tuple[int, ...] = (64, 64, 64)
     control_dt: bool = False  # True: u(x, t, dt), optimal in continuous time and held for dt; see CND.at_rate
     value: bool = True  # whether to train V(x, t) too
-    value_tails: int = 3000  # solved for V, from the tube and from the policy's own answers
-    value_iterations: int = 3000
+    value_tails: int = 6000  # solved for V, from the tube and from the policy's own answers
+    value_visits: int = 3000  # more of them, from states that the policy visits under kicks
+    value_iterations: int = 5000
     held_out: int = 64  # initial states that tell when to stop
     gap_median: float = 2e-4  # stop once both are met: (J - J*) / J*, median over the held-out states,
     gap_p95: float = 1e-3  # and its 95th percentile

@@ -233,8 +233,9 @@ class _Training:
     def _value(self) -> FeatureNet:
         s, rng = self.settings, self._rng(2_000_000)
         with self._stage("value labels", 1) as bar:
-            labels = ValueLabels.of(value_solutions(self.ddp, self.fine, self.bank, self.policy, self.f, s.value_tails,
-                                                    s.width, rng))
+            labels = ValueLabels.of(value_solutions(self.ddp, self.fine, self.bank, self.policy, self.f,
+                                                    tails=s.value_tails, visits=s.value_visits, width=s.width,
+                                                    kick=s.kick, rng=rng))
             bar.update()
         with _seeded(self.seed + 1):
             net = value_net(self.ocp, labels, s.hidden)

@@ -19,7 +19,7 @@ from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.bank import SolutionBank
 from nocl.solvers.cnd.features import features
-from nocl.solvers.cnd.labels import Field, answered, tube_states
+from nocl.solvers.cnd.labels import Field, answered, kicked_states, tube_states
 from nocl.solvers.cnd.regress import Loss
 from nocl.solvers.ddp import DDP, DDPSolution
 from nocl.to_torch import to_torch
@@ -52,14 +52,16 @@ class ValueLabels:
                              for name in ValueLabels.__dataclass_fields__))
 
 
-def value_solutions(ddp: DDP, fine: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, n: int, width: float,
-                    rng: np.random.Generator) -> list[DDPSolution]:
-    """The bank's solutions and tails from n states of the tube, on the fine grid: a held control costs O(h^2) more than
-    a continuous one."""
-    _, t0, x = tube_states(bank, n, width, ddp.ocp.horizon, rng)
-    tails, whole = answered(ddp, bank, policy, f, x, t0), bank.solution
+def value_solutions(ddp: DDP, fine: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, *, tails: int,
+                    visits: int, width: float, kick: float, rng: np.random.Generator) -> list[DDPSolution]:
+    """The bank's solutions, and tails from states of the tube and from those that the policy visits under kicks, on
+    the fine grid: a held control costs O(h^2) more than a continuous one."""
+    _, t0, x = tube_states(bank, tails, width, ddp.ocp.horizon, rng)
+    x_kicked, t_kicked = kicked_states(ddp.ocp, bank, policy, f, visits, kick, rng)
+    found = answered(ddp, bank, policy, f, np.concatenate([x, x_kicked]), np.concatenate([t0, t_kicked]))
     times = fine.intervals // ddp.intervals
-    return [fine.solve(s.x[:, 0], s.t[:, 0], u=np.repeat(s.u, times, axis=1)) for s in (whole, tails[tails.success])]
+    return [fine.solve(s.x[:, 0], s.t[:, 0], u=np.repeat(s.u, times, axis=1))
+            for s in (bank.solution, found[found.success])]
 
 
 def value_net(ocp: OCP, labels: ValueLabels, sizes: tuple[int, ...]) -> FeatureNet:
