@@ -77,16 +77,15 @@ class _Quadratic:
                 continue
             u = self._stationary(face)
             H = self.value(u)
-            better = H < lowest
+            better = ca.lt(H, lowest)
             best = ca.vertcat(*(ca.if_else(better, u[i], best[i]) for i in range(n)))
             lowest = ca.if_else(better, H, lowest)
         return best
 
     def _stationary(self, face: tuple[str, ...]) -> ca.SX:
         free = [i for i, side in enumerate(face) if side == "-"]
-        u = ca.vertcat(*(self.lb[i] if side == "l" else self.ub[i] if side == "u" else 0.0
-                         for i, side in enumerate(face)))
-        u = ca.SX(u)
+        ends = {"l": self.lb, "u": self.ub, "-": ca.DM.zeros(len(face))}
+        u = ca.SX(ca.vertcat(*(ends[side][i] for i, side in enumerate(face))))
         if free:
             slope = self.g[free] + ca.mtimes(self.Q[free, :], u)
             u[free] = -ca.mtimes(ca.inv_minor(self.Q[free, free]), slope)
