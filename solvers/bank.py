@@ -1,9 +1,10 @@
-"""Global optima by the batch: cold starts, neighbours re-solved from each other, a bank of solutions to start from."""
+"""A bank of solutions from t = 0: what lies near (x, t) is a guess for problems there, a feedback and a value."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,13 +13,12 @@ from scipy.spatial import KDTree
 
 from nocl import checks
 from nocl.checks import Array
-from nocl.sampling import Seed
 from nocl.solvers.ddp import DDP, DDPSolution
 
-Report = Callable[[str], None]  # told what is being done
-IMPROVED = 1e-6  # a cost lower by this share counts as an improvement
-SAME = 1e-3  # costs within this share count as the same optimum
-TINY = 1e-10  # ... and costs below it are equal
+Rows = NDArray[np.int64]
+FILE = "bank.safetensors"
+KIND = "solution bank"
+EQUAL = 1e-9  # of the scale: states closer than this are the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,16 +43,69 @@ class SolutionBank:
         if not len(kept):
             raise ValueError(f"no problem of {ddp.ocp.system.name} was solved ({solution.message[0]}): check the "
                              "horizon, the bounds and the costs, or give guesses of your own to DDP.solve(x0, u=...)")
-        box = np.asarray(ddp.ocp.system.ubx) - ddp.ocp.system.lbx
-        return SolutionBank(kept, np.maximum(kept.x.std(axis=(0, 1)), 0.05 * box))
+        return SolutionBank(kept, spread(ddp, kept))
 
     @staticmethod
     def from_arrays(ddp: DDP, arrays: dict[str, Any]) -> SolutionBank:
         """The bank of a solution's arrays, as a checkpoint keeps them."""
-        message = np.full(len(arrays["cost"]), "converged")
-        return SolutionBank.of(ddp, DDPSolution(**arrays, V_xx=None, message=message))
+        return SolutionBank.of(ddp, _solution(arrays))
 
-    def nearest(self, x: Array, t: ArrayLike = 0.0, count: int = 1) -> NDArray[np.int64]:
+    def add(self, solution: DDPSolution) -> SolutionBank:
+        """A bank with these solutions too, those that succeeded; of two from the same state the cheaper stays."""
+        grid = self.solution.u.shape[1:]
+        if solution.u.shape[1:] != grid or (solution.t != self.solution.t[0]).any():
+            raise ValueError(f"the bank's solutions have controls {grid} on [0, {self.horizon:g}]; got controls "
+                             f"{solution.u.shape[1:]} from t0 up to {solution.t[:, :1].max(initial=0):g}: solve them "
+                             "by the same DDP, from t0 = 0")
+        joined = DDPSolution.join([_plain(self.solution), _plain(solution[solution.success])])
+        order = np.argsort(joined.cost, kind="stable")
+        state = np.round(joined.x[order, 0] / (EQUAL * self.scale))
+        kept = order[np.sort(np.unique(state, axis=0, return_index=True)[1])]
+        return SolutionBank(joined[np.sort(kept)], self.scale)
+
+    def save(self, folder: str | os.PathLike[str]) -> Path:
+        """Write folder/bank.safetensors, data only, atomically."""
+        from nocl import store
+
+        arrays = {name: value for name, value in self.solution.arrays().items() if name != "message"}
+        return store.save_checkpoint(Path(folder) / FILE, {"solution": arrays, "scale": self.scale}, {"kind": KIND})
+
+    @staticmethod
+    def load(folder: str | os.PathLike[str]) -> SolutionBank:
+        """The bank that `save` wrote, bit by bit; ValueError for a missing, truncated, altered or foreign file."""
+        from nocl import store
+
+        path = Path(folder) / FILE
+        if not path.is_file():
+            raise ValueError(f"{path} does not exist; expected a folder that SolutionBank.save wrote: check the path")
+        state, meta = store.load_checkpoint(path)
+        if meta.get("kind") != KIND:
+            raise ValueError(f"{path} is no solution bank; expected a file of SolutionBank.save: name the right folder")
+        return SolutionBank(_solution(state["solution"]), state["scale"])
+
+    def interpolate(self, x: ArrayLike, t: ArrayLike = 0.0) -> tuple[Array, Array, Array]:
+        """(u, V, V_x) at states x [B, nx] and times t [B]: the nearest solution's, with u and V to first order in the
+        distance to it, u not clipped; V to second order where the bank has V_xx."""
+        rows = np.atleast_2d(np.asarray(x, dtype=np.float64))
+        times = np.broadcast_to(np.asarray(t, dtype=np.float64), len(rows))
+        near, s = self.nearest(rows, times)[:, 0], self.solution
+        k = self._interval(times)
+        away = rows - self.states(near, times[:, None])[:, 0]
+        part = times * s.u.shape[1] / self.horizon - k
+
+        def between(value: Array) -> Array:
+            share = part.reshape(-1, *[1] * (value.ndim - 2))
+            return (1 - share) * value[near, k] + share * value[near, k + 1]
+
+        V, V_x = between(s.V), between(s.V_x)
+        u = s.u[near, k] + np.einsum("bij,bj->bi", s.gain[near, k], away)
+        V = V + np.einsum("bi,bi->b", V_x, away)
+        if s.V_xx is not None:
+            bend = np.einsum("bij,bj->bi", between(s.V_xx), away)
+            V, V_x = V + np.einsum("bi,bi->b", bend, away) / 2, V_x + bend
+        return u, V, V_x
+
+    def nearest(self, x: Array, t: ArrayLike = 0.0, count: int = 1) -> Rows:
         """The `count` rows whose states at t (at the last node before it) are nearest to x [B, nx], the nearest first.
 
         t: a number or [B]. Returns [B, count], fewer columns where the bank has fewer rows.
@@ -66,154 +119,54 @@ class SolutionBank:
             found[here] = tree.query(x[here] / self.scale, columns)[1]
         return found
 
-    def guess(self, rows: NDArray[np.int64], t0: ArrayLike = 0.0) -> dict[str, Array]:
+    def guess(self, rows: Rows, t0: ArrayLike = 0.0) -> dict[str, Array]:
         """What DDP.solve starts from: solutions `rows` [B] resampled onto their own [t0, T], as u, x and gain."""
-        s, K = self.solution, self.solution.u.shape[1]
         start = np.broadcast_to(np.asarray(t0, dtype=np.float64), rows.shape)
-        times = start[:, None] + (self._horizon - start)[:, None] * np.arange(K + 1) / K
-        k = self._interval(times[:, :-1] + np.diff(times) / 2)
-        row = rows[:, None]
-        return {"u": s.u[row, k], "x": self.states(rows, times), "gain": s.gain[row, k]}
+        part = np.arange(self.solution.u.shape[1] + 1) / self.solution.u.shape[1]
+        return self._along(rows, start[:, None] + (self.horizon - start)[:, None] * part)
 
-    def states(self, rows: NDArray[np.int64], t: Array) -> Array:
+    def late(self, rows: Rows, start: Array, held: NDArray[np.bool_]) -> dict[str, Array]:
+        """Guesses from t = 0 of what solutions `rows` [B] do from times `start` [B] on: as fast, and held at their last
+        node, where `held`; else stretched to the whole horizon."""
+        t = self.horizon * np.arange(self.solution.u.shape[1] + 1) / self.solution.u.shape[1]
+        stretched = start[:, None] + (1 - start / self.horizon)[:, None] * t
+        return self._along(rows, np.where(held[:, None], np.minimum(start[:, None] + t, self.horizon), stretched))
+
+    def _along(self, rows: Rows, times: Array) -> dict[str, Array]:
+        k, row = self._interval(times[:, :-1] + np.diff(times) / 2), rows[:, None]
+        return {"u": self.solution.u[row, k], "x": self.states(rows, times), "gain": self.solution.gain[row, k]}
+
+    def states(self, rows: Rows, t: Array) -> Array:
         """x of solutions rows [B] at times t [B, n], linear between nodes: [B, n, nx]."""
         k, row = self._interval(t), rows[:, None]
-        part = (t * self.solution.u.shape[1] / self._horizon - k)[..., None]
+        part = (t * self.solution.u.shape[1] / self.horizon - k)[..., None]
         return (1 - part) * self.solution.x[row, k] + part * self.solution.x[row, k + 1]
 
     @property
-    def _horizon(self) -> float:
+    def horizon(self) -> float:
+        """T."""
         return float(self.solution.t[0, -1])
 
-    def _interval(self, t: ArrayLike) -> NDArray[np.int64]:
+    def _interval(self, t: ArrayLike) -> Rows:
         K = self.solution.u.shape[1]
-        return np.clip((np.asarray(t) * K / self._horizon).astype(np.int64), 0, K - 1)
+        return np.clip((np.asarray(t) * K / self.horizon).astype(np.int64), 0, K - 1)
 
 
-@dataclass(frozen=True, eq=False)
-class GlobalSolution:
-    """The best solution found of each problem, and how sure that is."""
-
-    best: DDPSolution
-    starts: NDArray[np.int64]  # [B], starts tried in all
-    hits: NDArray[np.int64]  # [B], how many of them ended at the best cost
-    optima: NDArray[np.int64]  # [B], how many different costs (SAME apart) the starts ended at
+def spread(ddp: DDP, solution: DDPSolution) -> Array:
+    """The states' standard deviations along solutions [nx], at least 5 % of X."""
+    box = np.asarray(ddp.ocp.system.ubx) - ddp.ocp.system.lbx
+    return np.asarray(np.maximum(solution.x.std(axis=(0, 1)), 0.05 * box))
 
 
-def cold_controls(ddp: DDP, n: int, seed: Seed) -> Array:
-    """n smooth random control histories [n, K, nu] in U, about u* or the middle of U, small to full amplitude."""
-    rng, system, K = np.random.default_rng(seed), ddp.ocp.system, ddp.intervals
-    lb, ub = np.asarray(system.lbu), np.asarray(system.ubu)
-    order = np.arange(8)
-    waves = np.cos(np.pi * order[:, None] * (np.arange(K) + 0.5) / K) / (1 + order)[:, None]
-    shape = np.einsum("bmk,kt->btm", rng.standard_normal((n, system.nu, 8)), waves)
-    amplitude = np.exp(rng.uniform(np.log(0.003), 0.0, (n, 1, 1))) * (ub - lb) / 2
-    base = np.where(rng.random((n, 1, 1)) < 0.5, np.asarray(ddp.ocp.u_goal), (lb + ub) / 2)
-    return np.ascontiguousarray(np.clip(base + amplitude * shape, lb, ub))
-
-
-def solve_globally(ddp: DDP, x0: ArrayLike, *, starts: int = 16, neighbours: int = 4, rounds: int = 6, seed: Seed = 0,
-                   report: Report = lambda _: None) -> GlobalSolution:
-    """Solve each problem from u* and cold starts, then from its neighbours' solutions until nothing improves.
-
-    Neighbours alone come to rest where a whole region shares a wrong basin: a random half of the states gets one more
-    cold start in each round, and so does each state whose best was found less than twice.
-
-    Parameters
-    ----------
-    x0 : [nx] or [B, nx], at t0 = 0
-    starts : cold starts for each state, u held at u* the first of them
-    neighbours, rounds : solutions of that many neighbours are tried, at most that many times over
-
-    Raises ValueError for wrong input; a state for which nothing converged has success False in `best`.
+def extend(ddp: DDP, bank: SolutionBank, x0: ArrayLike, neighbours: int = 3, t0: ArrayLike = 0.0) -> DDPSolution:
+    """Solve new problems (x0 [B, nx], t0) from the nearest solutions of a bank: the best of `neighbours` starts each.
     """
+    if neighbours < 1:
+        raise ValueError(f"neighbours is {neighbours}; expected at least 1")
     rows, _ = checks.states(x0, ddp.ocp.system.nx, ddp.ocp.system.name)
-    if min(starts, neighbours + 1, rounds + 1) < 1:
-        raise ValueError(f"starts is {starts}, neighbours {neighbours}, rounds {rounds}; expected starts >= 1, the "
-                         "others >= 0")
-    search = _Search(ddp, rows, np.random.default_rng(seed))
-    for start in range(starts):
-        report(f"cold start {start + 1} of {starts}")
-        search.cold(np.arange(len(rows)), straight=start == 0)
-    for round_ in range(rounds):
-        if not search.best.success.any():
-            break
-        report(f"neighbours, round {round_ + 1}")
-        former = search.best.cost
-        search.exchange(neighbours)
-        search.cold(search.doubtful())
-        if not _improved(former, search.best.cost).any():
-            break
-    return GlobalSolution(search.best, *search.counts())
-
-
-class _Search:
-    """The best of all that was tried from each state, and the costs at which each start ended."""
-
-    def __init__(self, ddp: DDP, x0: Array, rng: np.random.Generator) -> None:
-        self.ddp, self.x0, self.rng = ddp, x0, rng
-        self.best: DDPSolution
-        self.owners: list[NDArray[np.int64]] = []  # of each start, its state
-        self.costs: list[Array] = []
-        self.tried: set[tuple[int, int, float]] = set()  # (state, neighbour, the neighbour's cost)
-
-    def cold(self, rows: NDArray[np.int64], straight: bool = False) -> None:
-        """One cold start for each of these states, u held at u* or random."""
-        if straight:
-            self.best = self.ddp.solve(self.x0[rows])
-            self._count(rows, self.best)
-        elif rows.size:
-            self._merge(rows, self.ddp.solve(self.x0[rows], u=cold_controls(self.ddp, len(rows), self.rng)))
-
-    def exchange(self, neighbours: int) -> None:
-        """Solve each state from the nearest others' solutions, if they are new to it."""
-        solved = np.flatnonzero(self.best.success)
-        bank = SolutionBank.of(self.ddp, self.best)
-        near = bank.nearest(self.x0, count=neighbours + 1)
-        for column in near.T:
-            pairs = [(i, k) for i, k in enumerate(column) if solved[k] != i and self._new(i, int(solved[k]))]
-            if pairs:
-                rows, parents = np.array(pairs).T
-                self._merge(rows, self.ddp.solve(self.x0[rows], **bank.guess(parents)))
-
-    def _new(self, state: int, other: int) -> bool:
-        key = (state, other, float(self.best.cost[other]))
-        fresh = key not in self.tried
-        self.tried.add(key)
-        return fresh
-
-    def doubtful(self) -> NDArray[np.int64]:
-        """A random half of the states, and those whose best was found less than twice."""
-        _, hits, _ = self.counts()
-        return np.flatnonzero((self.rng.random(len(self.x0)) < 0.5) | (hits < 2))
-
-    def _merge(self, rows: NDArray[np.int64], found: DDPSolution) -> None:
-        self._count(rows, found)
-        whole = better(self.best[rows], found)
-        order = np.arange(len(self.x0))
-        order[rows] = len(self.x0) + np.arange(len(rows))
-        self.best = DDPSolution.join([self.best, whole])[order]
-
-    def _count(self, rows: NDArray[np.int64], found: DDPSolution) -> None:
-        self.owners.append(rows)
-        self.costs.append(found.cost)
-
-    def counts(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-        """(starts, those that ended at the best cost, different costs) of each state."""
-        owners, costs = np.concatenate(self.owners), np.concatenate(self.costs)
-        starts = np.bincount(owners, minlength=len(self.x0))
-        table = np.full((len(self.x0), max(starts, default=0)), np.inf)
-        order = np.argsort(owners, kind="stable")
-        column = np.arange(len(owners)) - np.repeat(np.cumsum(starts) - starts, starts)
-        table[owners[order], column] = costs[order]
-        return starts, _hits(table, self.best.cost), _distinct(table)
-
-
-def extend(ddp: DDP, bank: SolutionBank, x0: Array, neighbours: int = 3) -> DDPSolution:
-    """Solve new states x0 [B, nx] from the nearest solutions of a bank: the best of `neighbours` starts each."""
     best: DDPSolution | None = None
-    for rows in bank.nearest(x0, count=neighbours).T:
-        solution = ddp.solve(x0, **bank.guess(rows))
+    for near in bank.nearest(rows, t0, count=neighbours).T:
+        solution = ddp.solve(rows, t0, **bank.guess(near, t0))
         best = solution if best is None else better(best, solution)
     assert best is not None
     return best
@@ -230,17 +183,11 @@ def better(a: DDPSolution, b: DDPSolution) -> DDPSolution:
     return DDPSolution(**merged)
 
 
-def _improved(former: Array, now: Array) -> NDArray[np.bool_]:
-    finite = np.where(np.isfinite(former), former, 0.0)
-    return np.where(np.isfinite(former), now < finite - IMPROVED * np.abs(finite), np.isfinite(now))
+def _solution(arrays: dict[str, Any]) -> DDPSolution:
+    """A bank's solutions from their arrays without the messages."""
+    return DDPSolution.of_arrays({**arrays, "message": np.full(len(arrays["cost"]), "converged")})
 
 
-def _hits(costs: Array, best: Array) -> NDArray[np.int64]:
-    near = costs <= (best + np.maximum(SAME * np.abs(best), TINY))[:, None]
-    return (near & np.isfinite(costs)).sum(axis=1)
-
-
-def _distinct(costs: Array) -> NDArray[np.int64]:
-    ordered = np.sort(np.where(np.isfinite(costs), costs, np.nan), axis=1)  # NaN last, never apart from anything
-    apart = np.diff(ordered, axis=1) > np.maximum(SAME * np.abs(ordered[:, 1:]), TINY)
-    return np.isfinite(ordered[:, 0]).astype(np.int64) + apart.sum(axis=1)
+def _plain(solution: DDPSolution) -> DDPSolution:
+    """Without V_xx: a bank may get solutions with and without."""
+    return replace(solution, V_xx=None)

@@ -10,24 +10,30 @@ differential dynamic programming, ICRA 2014.
 
 from __future__ import annotations
 
+import json
 import os
-from collections.abc import Iterable
+import sys
 from dataclasses import dataclass, field
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from nocl import checks
 from nocl.checks import Array
 from nocl.kernels import Kernel
 from nocl.ocp import OCP
+from nocl.solvers.compiled import fingerprint
+from nocl.solvers.ddp_batch import Batch, DDPSolution, Job, Rows, assembled, pieces
 from nocl.solvers.ddp_kernel import ddp_source, pack_weights
+from nocl.solvers.pool import Journal, Pool, stream
 
 if TYPE_CHECKING:
     from nocl.sysid import LearnedDynamics
 
-Rows = NDArray[np.int64]  # problem numbers
 GROWTH, DECAY = 4.0, 2.0  # of mu, after a failure and a success: against 8 and 8, twice as many wild starts converge
 
 
@@ -49,39 +55,6 @@ class DDPSettings:
         if self.smallest_step > 1 or self.damping > self.largest_damping:
             raise ValueError(f"DDPSettings: smallest_step is {self.smallest_step}, damping {self.damping}, "
                              f"largest_damping {self.largest_damping}; expected smallest_step <= 1 and damping below")
-
-
-@dataclass(frozen=True, eq=False)
-class DDPSolution:
-    """Optimal trajectories from (x0, t0), with feedback and value derivatives at each node; rows [B, ...]."""
-
-    t: Array  # [B, K+1]
-    x: Array  # [B, K+1, nx]
-    u: Array  # [B, K, nu]
-    gain: Array  # [B, K, nu, nx], du/dx of the optimal feedback, 0 where a bound is active
-    V: Array  # [B, K+1]
-    V_x: Array  # [B, K+1, nx], the costate
-    V_xx: Array | None  # [B, K+1, nx, nx], where asked for
-    cost: Array  # [B], inf where the problem failed
-    success: NDArray[np.bool_]  # [B]
-    message: NDArray[np.str_]  # [B]
-    iterations: Rows  # [B]
-
-    def __len__(self) -> int:
-        return len(self.cost)
-
-    def __getitem__(self, rows: Any) -> DDPSolution:
-        """The solutions of some rows (a slice, a mask or indices)."""
-        picked: dict[str, Any] = {name: None if value is None else value[rows] for name, value in vars(self).items()}
-        return DDPSolution(**picked)
-
-    @staticmethod
-    def join(parts: Iterable[DDPSolution]) -> DDPSolution:
-        """Several batches as one."""
-        batches = [vars(p) for p in parts]
-        joined: dict[str, Any] = {name: None if first is None else np.concatenate([b[name] for b in batches])
-                                  for name, first in batches[0].items()}
-        return DDPSolution(**joined)
 
 
 class DDP:
@@ -108,14 +81,23 @@ class DDP:
             if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
                 raise ValueError(f"DDP: {name} is {value!r}; expected an integer >= 1")
         self.ocp, self.intervals, self.settings = ocp, int(intervals), settings or DDPSettings()
-        self.threads = threads or os.cpu_count() or 1
+        self.threads = int(threads or os.cpu_count() or 1)
+        self.dynamics, self.cache = dynamics, cache
         net = None if dynamics is None else _fitting(ocp, dynamics)
         self._weights = np.zeros(1) if net is None else pack_weights(net)
         self._kernel = Kernel(ddp_source(ocp, net), cache)
         self._lb, self._ub = np.ascontiguousarray(ocp.system.lbu), np.ascontiguousarray(ocp.system.ubu)
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {"ocp": self.ocp, "intervals": self.intervals, "dynamics": self.dynamics, "settings": self.settings,
+                "threads": self.threads, "cache": self.cache}
+
+    def __setstate__(self, options: dict[str, Any]) -> None:
+        DDP.__init__(self, **options)  # the kernel is built, or found in the cache, where it is needed
+
     def solve(self, x0: ArrayLike, t0: ArrayLike = 0.0, *, u: Array | None = None, x: Array | None = None,
-              gain: Array | None = None, curvature: bool = False) -> DDPSolution:
+              gain: Array | None = None, curvature: bool = False, workers: int | str = "auto",
+              out: str | os.PathLike[str] | None = None, progress: bool | None = None) -> DDPSolution:
         """Descend from a guess u [B, K, nu] (default u*), followed with u + gain (x' - x) where x and gain are given.
 
         Parameters
@@ -123,15 +105,78 @@ class DDP:
         x0 : [nx] or [B, nx]
         t0 : number or [B], each < horizon
         curvature : whether to return V_xx
+        workers : "auto" (this process, `threads` of it), a number of threads, or "tcp://...", a Dask scheduler
+        out : a folder that gets each piece of the batch as soon as it is solved: the same call resumes what is there
+        progress : a bar on stderr; default: where that is a terminal
 
         Raises ValueError before any work for wrong shapes, x0 that is not finite and t0 outside [0, horizon). A problem
         whose guess blows up, or that finds no minimum, has success False, cost inf and a message; the others go on.
+        Rows do not depend on each other, nor on `workers`.
         """
         rows, _ = checks.states(x0, self.ocp.system.nx, self.ocp.system.name)
-        x0 = np.ascontiguousarray(rows)
-        work = _Work(self, x0, self._start_times(t0, len(x0)), u, x, gain)
+        rows = np.ascontiguousarray(rows)
+        times, (pool, here) = self._start_times(t0, len(rows)), self._where(workers)
+        guess = self._guesses(len(rows), u=u, x=x, gain=gain)
+        journal = Journal(None if out is None else Path(out), self._run_key(rows, times, guess, curvature) if out
+                          else "", "DDP")
+        show = sys.stderr.isatty() if progress is None else progress
+        tasks = pieces(self, rows, times, guess, curvature)
+        return assembled(len(rows), stream(Job(here), tasks, pool, journal, show, f"DDP, {self.ocp.system.name}"))
+
+    def descend(self, batch: Batch) -> DDPSolution:
+        """Solve one piece of a batch, here."""
+        work = _Work(self, batch.x0, batch.t0, *(batch.guess.get(name) for name in ("u", "x", "gain")))
         work.descend()
-        return work.solution(curvature)
+        return work.solution(batch.curvature)
+
+    def rollout(self, x0: Array, **guess: Array) -> Array:
+        """The states [B, K+1, nx] from x0 [B, nx] at t0 = 0 under a guess of `solve`'s: where the descent begins."""
+        given = self._guesses(len(x0), **guess)
+        work = _Work(self, np.ascontiguousarray(x0), np.zeros(len(x0)), *(given.get(k) for k in ("u", "x", "gain")))
+        return work.x
+
+    def feedback(self, x: Array, u: Array) -> Array:
+        """Gains [B, K, nu, nx] of one sweep about x [B, K+1, nx], u [B, K, nu]: those of the OCP's cost, damped until
+        it is convex there; 0 where no damping helps."""
+        B, s = len(x), self.settings
+        work = _Work(self, np.ascontiguousarray(x[:, 0]), np.zeros(B), None, None, None)
+        work.x[:], work.u[:] = x, u
+        rows = np.arange(B)
+        while rows.size:
+            work._backward(rows)
+            rows = rows[work.positive[rows] == 0]
+            work.mu[rows] = np.maximum(GROWTH * work.mu[rows], s.damping)
+            work.gain[rows] = 0.0
+            rows = rows[work.mu[rows] <= s.largest_damping]
+        return work.gain
+
+    def _where(self, workers: int | str) -> tuple[Pool, DDP]:
+        """The pool, and the DDP that works in it: on a cluster each worker's threads have pieces of their own."""
+        pool = Pool(workers)
+        if isinstance(workers, str):
+            return (Pool(1), self) if workers == "auto" else (pool, self._with_threads(1))
+        return Pool(1), self._with_threads(int(workers))
+
+    def _with_threads(self, threads: int) -> DDP:
+        other = object.__new__(DDP)
+        other.__dict__.update(vars(self), threads=threads)
+        return other
+
+    def _guesses(self, B: int, **given: Array | None) -> dict[str, Array]:
+        K, nx, nu = self.intervals, self.ocp.system.nx, self.ocp.system.nu
+        shapes = {"u": (B, K, nu), "x": (B, K + 1, nx), "gain": (B, K, nu, nx)}
+        return {name: _shaped(value, shapes[name], name) for name, value in given.items() if value is not None}
+
+    @cached_property
+    def key(self) -> str:
+        """A fingerprint of the problem, the model and the settings."""
+        net = None if self.dynamics is None else self.dynamics.net
+        return fingerprint(json.dumps(self.ocp.to_data(), sort_keys=True), ddp_source(self.ocp, net), self._weights,
+                           self.intervals, self.settings, version("nocl"))
+
+    def _run_key(self, x0: Array, t0: Array, guess: dict[str, Array], curvature: bool) -> str:
+        """A fingerprint of all that the solution depends on."""
+        return fingerprint(self.key, x0, t0, *(part for pair in sorted(guess.items()) for part in pair), curvature)
 
     def _start_times(self, t0: ArrayLike, B: int) -> Array:
         given = np.asarray(t0, dtype=np.float64)
@@ -167,9 +212,9 @@ class _Work:
         self.mu, self.alpha, self.iterations = np.zeros(B), np.zeros(B), np.zeros(B, dtype=np.int64)
         self.state = np.zeros(B, dtype=np.int64)  # an index of MESSAGES
         self.refused = np.full(B, -1.0)  # the largest mu at which the last sweep's trajectory was not convex
-        u = _guess(self.guess_u, (B, K, nu), "u", np.broadcast_to(ocp.u_goal, (B, K, nu)))
-        x = _guess(self.guess_x, (B, K + 1, nx), "x", self.x)
-        gain = _guess(self.guess_gain, (B, K, nu, nx), "gain", self.gain)
+        u = np.broadcast_to(ocp.u_goal, (B, K, nu)).copy() if self.guess_u is None else self.guess_u
+        x = self.x if self.guess_x is None else self.guess_x
+        gain = self.gain if self.guess_gain is None else self.guess_gain
         self._rollout(np.arange(B), x, u, gain)
         self.x[:], self.u[:], self.J = self.new_x, self.new_u, self.new_J.copy()
         self.state[~np.isfinite(self.J)] = BLEW_UP
@@ -212,7 +257,7 @@ class _Work:
         """One more full Newton step where J does not rise: what is left of u's error is squared."""
         self.alpha[rows] = 1.0
         self._rollout(rows, self.x, self.u, self.gain)
-        won = rows[self.new_J[rows] <= self.J[rows]]
+        won = rows[self.new_J[rows] <= self.J[rows] + 4e-15 * np.abs(self.J[rows])]  # rounding decides nothing
         self._take(won)
 
     def _take(self, rows: Rows) -> None:
@@ -275,9 +320,7 @@ def _fitting(ocp: OCP, dynamics: LearnedDynamics) -> Any:
     return dynamics.net
 
 
-def _guess(value: Array | None, shape: tuple[int, ...], name: str, default: Array) -> Array:
-    if value is None:
-        return np.ascontiguousarray(default, dtype=np.float64)
+def _shaped(value: Array, shape: tuple[int, ...], name: str) -> Array:
     array = np.ascontiguousarray(value, dtype=np.float64)
     if array.shape != shape:
         raise ValueError(f"DDP: the guess {name} has shape {array.shape}; expected {shape}, a row for each x0")

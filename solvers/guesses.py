@@ -7,6 +7,8 @@ from collections.abc import Iterator
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 
 from nocl.checks import Array
 from nocl.data import Controller
@@ -20,8 +22,9 @@ SCALES = (0.05, 1.0)  # of a random control, in half widths of U
 FAR = 1.5  # widths of X round the goal: a rollout that leaves them is too wild to start from
 HALVINGS = 12  # of a random control, until its rollout stays there
 BULGES = 0.1 * 1.4 ** np.arange(12)  # of a line round an obstacle, in lengths of the line
-LARGEST = 8  # nx + nu up to which mirror images of the problem are looked for, by trying all signs
+LARGEST = 10  # groups of coordinates up to which mirror images of the problem are looked for, by trying all signs
 PROBES = 5  # states that a mirror image must hold at
+ROUNDING = 1e-9  # of the largest: a derivative that counts as none
 EQUAL = 1e-10  # relative difference of equal costs and derivatives
 
 
@@ -147,10 +150,14 @@ def _across(gradients: ca.DM, i: int, along: Array) -> Array | None:
 def mirrors(ocp: OCP) -> list[tuple[Array, Array]]:
     """Signs (of x - x* [nx], of u - u* [nu]) under which f, L, G, h and U stay what they are, other than all +1.
 
-    Found by trial at random points, so up to rounding; none are looked for where nx + nu > LARGEST.
+    Found by trial at random points, so up to rounding; none are looked for with more than LARGEST groups of
+    coordinates that f, L and G couple at the goal, and so must share a sign.
     """
     s = ocp.system
-    if s.nx + s.nu > LARGEST:
+    if s.xdot is None:  # a plant that is not known: no symmetry is
+        return []
+    group = _coupled(ocp)
+    if group.max() >= LARGEST:
         return []
     rng, n = np.random.default_rng(0), s.nx
     z = rng.uniform(-0.5, 0.5, (PROBES, n + s.nu)) * np.r_[s.ubx - s.lbx, s.ubu - s.lbu] / 2
@@ -163,13 +170,26 @@ def mirrors(ocp: OCP) -> list[tuple[Array, Array]]:
         return np.vstack([f, ocp.L(x, u).full(), ocp.G(x).full(), np.sort(ocp.h(x).full(), axis=0)])
 
     same, found = everything(np.ones(n + s.nu)), []
-    for flips in itertools.product((1.0, -1.0), repeat=n + s.nu):
-        signs = np.array(flips)
+    for flips in itertools.product((1.0, -1.0), repeat=int(group.max()) + 1):
+        signs = np.array(flips)[group]
         if (signs > 0).all() or np.abs(middle[signs[n:] < 0]).max(initial=0.0) > 0:
             continue
         if np.abs(everything(signs) - same).max() <= EQUAL * np.abs(same).max():
             found.append((signs[:n], signs[n:]))
     return found
+
+
+def _coupled(ocp: OCP) -> NDArray[np.int32]:
+    """A number for each of (x, u), equal where f's Jacobian or a Hessian of L or G at the goal couples them."""
+    s = ocp.system
+    n, z = s.nx, ca.vertcat(s.x, s.u)
+    H = ca.hessian(ocp.running, z)[0] + ca.diagcat(ca.hessian(ocp.terminal, s.x)[0], ca.SX(s.nu, s.nu))
+    links = ca.Function("links", [s.x, s.u], [ca.jacobian(s.xdot, z), H])
+    A, H = (part.full() for part in links(ocp.x_goal, ocp.u_goal))
+    scale = np.r_[s.ubx - s.lbx, s.ubu - s.lbu]
+    A, H = np.abs(A * scale) / scale[:n, None], np.abs(H * np.outer(scale, scale))
+    H[:n] += A
+    return np.asarray(connected_components(H > ROUNDING * H.max(), directed=False)[1])
 
 
 def mirrored(ocp: OCP, mirror: tuple[Array, Array], x: Array, u: Array) -> Guess:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from nocl.checks import Array
 from nocl.solvers.guesses import Guess
@@ -92,6 +93,16 @@ def _second_opinion(program: Transcription, task: Task, answers: Sequence[Answer
     return [replace(answer, message=f"{answer.message}, by IPOPT after fatrop: {best.message}")]
 
 
+def distinct(costs: ArrayLike) -> Array:
+    """(cost, how many reached it) of each local optimum among costs, inf where there is none, rising [n, 2]."""
+    found = np.sort(np.asarray(costs, dtype=np.float64))
+    found = found[np.isfinite(found)]
+    if not found.size:
+        return np.zeros((0, 2))
+    first = np.r_[True, np.diff(found) > np.maximum(SAME * np.abs(found[1:]), TINY)]
+    return np.c_[found[first], np.diff(np.r_[np.flatnonzero(first), len(found)])]
+
+
 @dataclass(eq=False)
 class Search:
     """All that was tried from one state, in the order of the tasks."""
@@ -131,12 +142,7 @@ class Search:
     @property
     def optima(self) -> Array:
         """(cost, starts that found it) of each local optimum found, rising [n, 2]."""
-        costs = np.sort(np.array(self.costs, dtype=np.float64))
-        costs = costs[np.isfinite(costs)]
-        if not costs.size:
-            return np.zeros((0, 2))
-        first = np.r_[True, np.diff(costs) > np.maximum(SAME * np.abs(costs[1:]), TINY)]
-        return np.c_[costs[first], np.diff(np.r_[np.flatnonzero(first), len(costs)])]
+        return distinct(self.costs)
 
     @property
     def message(self) -> str:
