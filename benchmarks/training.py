@@ -25,34 +25,21 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
 import provenance
+from controllers import optimum
 
 import nocl
-from nocl.checks import Array
 from nocl.ocp import OCP
 from nocl.simulate import simulate
-from nocl.solvers.bank import better, solve_globally
 from nocl.solvers.cnd import TrainSettings
-from nocl.solvers.cnd.labels import policy_controls
 from nocl.solvers.cnd.paper import PaperSettings, train_paper
-from nocl.solvers.ddp import DDP
 
 STEP, BATCH = 0.02, 4096  # the published code's: seconds of an Euler step, initial states an iteration
-FINE = 640  # intervals of the reference
-
-
-def reference(ocp: OCP, x0: Array, policy: torch.nn.Module) -> Array:
-    """J* [B]: the best of cold starts, neighbours and the controller's own rollout."""
-    coarse, fine = DDP(ocp), DDP(ocp, intervals=FINE)
-    found = solve_globally(coarse, x0, starts=8, seed=99).best
-    own = policy_controls(policy, nocl.to_torch(ocp.system.f), x0, np.zeros(len(x0)), ocp.horizon, FINE)
-    repeated = np.repeat(found.u, FINE // coarse.intervals, axis=1)
-    return better(fine.solve(x0, u=repeated), fine.solve(x0, u=own)).cost
 
 
 def judged(ocp: OCP, cnd: nocl.CND, n: int) -> dict[str, float]:
     """The gap on n hidden initial states, as continuous feedback under CVODES on the exact f."""
     x0 = ocp.initial_states.sample(n, 12345)
-    gap = simulate(ocp, cnd, x0).cost / reference(ocp, x0, cnd.policy) - 1
+    gap = simulate(ocp, cnd, x0).cost / optimum(ocp, x0, cnd.policy).cost - 1
     return {"gap_median_%": round(100 * float(np.median(gap)), 4),
             "gap_p95_%": round(100 * float(np.quantile(gap, 0.95)), 4)}
 
