@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import base64
-import io
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,13 +10,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from nocl.checks import Array
+from nocl.comparisons.explain import explained_method, worst_states
+from nocl.comparisons.figures_study import study_figures
 from nocl.comparisons.report import Report, percent
-
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")  # Okabe, Ito: safe for all eyes
-DASHES = ("-", "--", "-.", ":")
-STYLE: dict[Any, Any] = {"svg.fonttype": "path", "svg.hashsalt": "nocl", "font.size": 9, "axes.spines.top": False,
-         "axes.spines.right": False, "axes.grid": True, "grid.alpha": 0.25, "legend.frameon": False}
-SMALL_GAP = 1e-2  # per cent: the gap axis is linear below it
+from nocl.comparisons.style import COLOURS, SMALL_GAP, STYLE, look, plain
 
 
 def draw(report: Report) -> dict[str, Figure]:
@@ -27,46 +22,21 @@ def draw(report: Report) -> dict[str, Figure]:
         figures = {"gaps": gaps(report)}
         if len(report.judged) > 1:
             figures["costs"] = costs(report)
+        figures |= {name: figure for name, make in study_figures().items() if (figure := make(report)) is not None}
+        for figure in figures.values():  # laid out once, not for each file
+            figure.draw_without_rendering()
+            figure.set_layout_engine("none")
         figures["trajectories"] = trajectories(report, typical_states(report))
         figures["worst"] = trajectories(report, worst_states(report)[:3])
-        for name in {"gaps", "costs"} & set(figures):  # laid out once, not for each file
-            figures[name].draw_without_rendering()
-            figures[name].set_layout_engine("none")
         return figures
 
 
-NAMES = ("gaps", "costs", "trajectories", "worst")  # the names that `draw` may use
-
-
-def encode(figure: Figure, form: str) -> bytes:
-    """A figure as SVG or PNG, the same bytes for the same report."""
-    file = io.BytesIO()
-    with matplotlib.rc_context(STYLE):
-        figure.savefig(file, format=form, dpi=150, metadata={"Date": None} if form == "svg" else {"Software": None})
-    return file.getvalue()
-
-
-def data_uri(svg: bytes) -> str:
-    return "data:image/svg+xml;base64," + base64.b64encode(svg).decode()
-
-
-def look(m: int) -> dict[str, Any]:
-    """Colour and dash of the m-th method: they tell methods apart without colour, too."""
-    return {"color": COLOURS[m % len(COLOURS)], "linestyle": DASHES[m % len(DASHES)]}
-
-
-def plain(text: str) -> str:
-    """Text as matplotlib draws it unchanged: a pair of $ would start a formula."""
-    return text.replace("$", r"\$")
-
-
-def worst_states(report: Report) -> list[int]:
-    """States by the gap of the first method, the widest first."""
-    return np.argsort(-report.gap[0], kind="stable").tolist()
+# the names that `draw` may use
+NAMES = ("gaps", "costs", "map", "value", "timings", "robustness", "stability", "regions", "trajectories", "worst")
 
 
 def typical_states(report: Report) -> list[int]:
-    """Where the first method's gap is the least, at its median, and the widest."""
+    """Where the explained method's gap is the least, at its median, and the widest."""
     order = worst_states(report)
     return list(dict.fromkeys([order[-1], order[len(order) // 2], order[0]]))
 
@@ -139,8 +109,8 @@ def trajectories(report: Report, states: Sequence[int]) -> Figure:
 
 
 def _gap_title(report: Report, i: int) -> str:
-    gap = report.gap[0, i]
-    name = plain(report.judged[0].name)
+    m = explained_method(report)
+    gap, name = report.gap[m, i], plain(report.judged[m].name)
     return f"{name} +{percent(max(gap, 0.0))} %" if np.isfinite(gap) else f"{name} failed"
 
 

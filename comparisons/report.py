@@ -164,14 +164,19 @@ class Report:
                 "ms_first": mean(j.ms_first), "solves": mean(j.solves), "ms_per_solve": mean(_each_answer(j)),
                 "ms_per_control": mean(j.ms_per_control)}
 
-    def save(self, folder: str | Path) -> Path:
-        """Write report.html, rows.csv, summary.json and figures/ into the folder, and return the path of report.html.
+    def save(self, folder: str | Path, animation: bool | None = None, draw: Any = None) -> Path:
+        """Write report.html and its companions (files.py lists them) into the folder; return the path of report.html.
 
         A report that stands there is replaced, file by file and each atomically; other files stay.
+
+        Parameters
+        ----------
+        animation : whether to make animation.gif, of the first two methods side by side; default: up to 200 states
+        draw : how the system is drawn there: see nocl.comparisons.animate
         """
         from nocl.comparisons.files import write_report  # matplotlib is imported where pictures are drawn
 
-        return write_report(self, Path(folder))
+        return write_report(self, Path(folder), animation, draw)
 
     def __str__(self) -> str:
         what = f"{self.ocp.system.name}, {count(len(self.x0), 'initial state')} {self.settings['initial states']}"
