@@ -30,7 +30,7 @@ from nocl.nets import FeatureNet
 from nocl.smoothing import Smooth, noise
 
 NOISE_FLOOR = 1e-3  # of a state's spread: logs without noise would weigh rounding
-CHUNK = 100  # windows whose sensitivities are held at a time
+CHUNK = 50  # windows whose sensitivities are held at a time
 REJECTIONS = 8  # of a step, before it is given up
 
 

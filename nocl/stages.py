@@ -21,18 +21,16 @@ from typing import Any
 import numpy as np
 
 from nocl import __version__, store
-from nocl.checks import Array
 from nocl.logs import Log
 from nocl.ocp import OCP
 from nocl.solvers.cnd import CND, TrainSettings, train
 from nocl.sysid import LearnedDynamics, LogSettings, Settings, identify
 
 QUICK_IDENTIFY = Settings(iterations=300, polish=10)
-QUICK_LOG = LogSettings(width=16, iterations=100, steps=4)
+QUICK_LOG = LogSettings(width=12, iterations=60, steps=3, window=20)
 QUICK_TRAIN = TrainSettings(seeds=6, starts=6, states=60, tails=300, visits=200, rounds=1, iterations=400,
                             value_tails=400, value_visits=200, value_iterations=300, held_out=16)
 PARTS = ("dynamics", "cnd", "export", "report", "checkpoint")  # folders in a run's folder
-REFINED = 4  # intervals of the comparison's reference for one of NMPC's
 KEY = "run"  # of a card: what the stage was made from
 
 
@@ -124,40 +122,29 @@ class Stages:
         say(f"export: {certificate}, {time.perf_counter() - start:.1f} s")
 
     def compare(self, cnd: CND, out: Path, methods: Sequence[str], n: int, intervals: int,
-                hold: int | None = None) -> None:
-        """Judge the methods on n fresh initial states, save the report and print its summary and verdict."""
-        from nocl.comparisons import compare, reference
+                hold: Sequence[int | None] | None = None, robust: bool = False) -> None:
+        """Study the methods on n fresh initial states, save the report and print its summary and verdict."""
+        from nocl.comparisons import study
+        from nocl.comparisons.robustness import mass_variants
 
-        x0 = fresh_states(self.ocp, n, self.seed)
-        chosen: dict[str, Any] = {name: cnd if name == "CND" else method(self.ocp, name, intervals) for name in methods}
-        checkpoint = self._nmpc_checkpoint(n, intervals)
-        if "NMPC" in chosen:
-            say(f"NMPC: solving {n} initial states, {intervals} intervals")
-            chosen["NMPC"] = chosen["NMPC"].solve(x0, out=checkpoint)
-        say(f"comparing {', '.join(methods)} on the exact dynamics")
-        chosen[reference.NAME] = self._reference(cnd, chosen.get("NMPC"), x0, intervals)
-        report = compare(self.ocp, chosen, n=n, seed=fresh_seed(self.seed), hold=hold)
+        chosen = {name: cnd if name == "CND" else method(self.ocp, name, intervals) for name in methods}
+        model = self._dynamics_there() if cnd.card.get("dynamics") == "learned" else None
+        checkpoint = self._checkpoint(methods=list(methods), n=n, intervals=intervals, hold=str(hold), robust=robust)
+        say(f"comparing {', '.join(methods)} on {n} initial states, on the exact dynamics")
+        report = study(self.ocp, chosen, n=n, seed=fresh_seed(self.seed), hold=hold, model=model, robust=robust,
+                       variants=mass_variants(self.ocp) if robust else None, out=checkpoint)
         path = report.save(out)
         _forget(checkpoint)
         say(f"\n{report}\n\nreport: {path}")
-
-    def _reference(self, cnd: CND, nmpc: Any, x0: Array, intervals: int) -> Any:
-        """The optimum on a grid REFINED times finer, from NMPC's controls and from the controller's own."""
-        from nocl.comparisons.reference import Reference
-        from nocl.simulate import simulate
-
-        fine = REFINED * intervals
-        guesses = [simulate(self.ocp, cnd, x0, hold=intervals, nodes=intervals + 1).u[:, :-1]]
-        return Reference(self.ocp, fine, guesses + ([] if nmpc is None else [nmpc.u]))
 
     def _made_from(self, **settings: Any) -> dict[str, Any]:
         problem = hashlib.sha256(json.dumps(self.ocp.to_data(), sort_keys=True).encode()).hexdigest()
         return {"problem": problem, "seed": self.seed, "quick": self.quick, **settings}
 
-    def _nmpc_checkpoint(self, n: int, intervals: int) -> Path:
-        """Where NMPC's answers so far are kept while a comparison lasts: another one goes elsewhere."""
-        key = json.dumps([self._made_from(n=n, intervals=intervals), __version__, version("casadi")], sort_keys=True)
-        return self.folder / "checkpoint" / f"nmpc-{hashlib.sha256(key.encode()).hexdigest()[:12]}"
+    def _checkpoint(self, **settings: Any) -> Path:
+        """Where outcomes so far are kept while a comparison lasts: another one goes elsewhere."""
+        key = json.dumps([self._made_from(**settings), __version__, version("casadi")], sort_keys=True)
+        return self.folder / "checkpoint" / f"compare-{hashlib.sha256(key.encode()).hexdigest()[:12]}"
 
     def _dynamics_there(self) -> LearnedDynamics | None:
         folder = self.folder / "dynamics"
@@ -225,11 +212,13 @@ def method(ocp: OCP, name: str, intervals: int) -> Any:
     match name.upper():
         case "NMPC":
             return solvers.NMPC(ocp, intervals=intervals)
+        case "NMPC-LOOP":
+            return solvers.NMPC(ocp, intervals=intervals).controller()
         case "DDP":
             return solvers.DDP(ocp, intervals=intervals)
         case "LQR":
             return solvers.LQR(ocp)
-    raise ValueError(f"method is {name!r}; expected NMPC, DDP or LQR")
+    raise ValueError(f"method is {name!r}; expected NMPC, NMPC-LOOP, DDP or LQR")
 
 
 def solve(ocp: OCP, out: Path, name: str, n: int, seed: int, intervals: int) -> None:

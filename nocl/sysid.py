@@ -170,7 +170,7 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
     settings : Settings, (method "paper") PaperSettings or (logs) LogSettings
         Budgets and sizes.
     checkpoint : folder
-        Finished networks are kept there, and not trained again when the same call is repeated ("paper": unused).
+        Finished networks are kept there, and not trained again when the same call is repeated ("paper", logs: unused).
 
     Raises
     ------

@@ -13,6 +13,7 @@ from nocl.checks import Array
 from nocl.integrate import rk4_interval
 from nocl.logs import Log, Run
 from nocl.smoothing import smooth
+from nocl.threads import one_thread
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -79,6 +80,7 @@ class Validation:
         return figure
 
 
+@one_thread()
 def validate(f: Field, log: Log, steps: Sequence[int] = HORIZONS, every: int | None = None,
              substeps: int = 1) -> Validation:
     """Simulate f by RK4 from every `every`-th sample (default: about 2,000 of the log's), k steps on, k in `steps`.

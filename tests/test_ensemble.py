@@ -11,7 +11,7 @@ from nocl.ensemble import Ensemble
 from nocl.sysid import Settings
 from nocl.systems import dubins, pendulum, van_der_pol
 
-SMALL = Settings(iterations=200, polish=25, polish_batch=512, width=16)
+SMALL = Settings(iterations=150, polish=15, polish_batch=512, width=12)
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,7 @@
 """Logs: reading and refusing, smoothing, and models that are learned from noisy trajectories."""
 
+import dataclasses
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -11,11 +13,12 @@ from nocl.cli import main
 from nocl.coverage import Coverage
 from nocl.logs import Log
 from nocl.smoothing import dataset, noise, smooth
+from nocl.solvers.ddp import DDP
 from nocl.sysid import LearnedDynamics, LogSettings, identify
 from nocl.systems import cartpole, pendulum
 from nocl.validation import validate
 
-FAST = LogSettings(width=8, iterations=40, steps=5, window=25)
+FAST = LogSettings(width=6, iterations=30, steps=4, window=20)
 
 
 def oscillator(known: bool = True) -> nocl.System:
@@ -176,7 +179,7 @@ def test_a_linear_system_from_noisy_logs(model):
 
 def test_simulation_error_beats_derivatives(log, model):
     first = identify(oscillator(False), data=log, known={"p": "v"}, control_affine=True, progress=False,
-                     settings=LogSettings(width=8, iterations=40, steps=0))
+                     settings=dataclasses.replace(FAST, steps=0))
     test = linear_log(oscillator(), 0.0, runs=4, seed=9)
     before, after = (m.validate(test, (1, 20, 50)).relative for m in (first, model))
     assert after[1] < 0.5 * before[1]
@@ -221,6 +224,16 @@ def test_a_problem_on_the_learned_system(model):
     got = system.f(x.numpy().T, u.numpy().T).full().T
     np.testing.assert_allclose(got, model(x, u).numpy(), atol=1e-12)
     assert system.names == model.system.names
+
+
+def test_a_problem_on_the_plant_itself_is_solved_on_the_model(model):
+    """The same optimum from xdot=None with dynamics=model, and from the learned system's equations."""
+    costs = []
+    for system, dynamics in ((model.system, model), (model.to_system(), None)):
+        ocp = nocl.OCP.quadratic(system, horizon=1.0, x_goal=[0, 0], u_goal=[0],
+                                 initial_states=nocl.Gaussian(mean=[0.5, 0], std=[0.1, 0.1]))
+        costs.append(DDP(ocp, intervals=20, dynamics=dynamics).solve([0.5, 0.0]).cost[0])
+    assert costs[0] == pytest.approx(costs[1], rel=1e-9)
 
 
 def test_outside_warns(model):
