@@ -104,9 +104,10 @@ class Loss:
 
     @property
     def lost(self) -> Array:
-        """[B], 100 (cost - best) / |best|, inf where it failed."""
-        lost = 100 * (self.cost - self.best) / np.maximum(np.abs(self.best), 1e-8)
-        return np.where(self.success & np.isfinite(self.best), lost, np.inf)
+        """[B], 100 (cost - best) / |best|; inf where it failed, NaN where no optimum is known."""
+        with np.errstate(invalid="ignore"):
+            lost = 100 * (self.cost - self.best) / np.maximum(np.abs(self.best), 1e-8)
+        return np.where(np.isfinite(self.best), np.where(self.success, lost, np.inf), np.nan)
 
     def summary(self) -> Row:
         return {"method": self.method, "how": self.how, "failures": int((~self.success).sum()),

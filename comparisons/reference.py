@@ -13,6 +13,7 @@ from nocl.solvers.bank import better
 from nocl.solvers.ddp import DDP, DDPSolution
 
 NAME = report.REFERENCE
+SLOTS = 40  # kicks fall on multiples of the horizon over SLOTS
 
 
 class Reference:
@@ -24,7 +25,7 @@ class Reference:
     Parameters
     ----------
     guesses : sequence of controls [B, K, nu]
-        Held on K equal intervals, K a divisor of `intervals`; NaN stands for u*.
+        Held on K equal intervals; NaN stands for u*.
     """
 
     def __init__(self, ocp: OCP, intervals: int, guesses: Sequence[Array] = ()) -> None:
@@ -36,6 +37,25 @@ class Reference:
         best = ddp.solve(x0)
         goal = np.asarray(self.ocp.u_goal)
         for guess in self.guesses:
-            u = np.repeat(guess, self.intervals // guess.shape[1], axis=1)
-            best = better(best, ddp.solve(x0, u=np.where(np.isfinite(u), u, goal)))
+            u = guess[:, np.arange(self.intervals) * guess.shape[1] // self.intervals]
+            best = better(best, ddp.solve(x0, u=np.ascontiguousarray(np.where(np.isfinite(u), u, goal))))
         return best
+
+
+def resolved(ocp: OCP, start: DDPSolution, kicks: Sequence[tuple[int, Array]]) -> Array:
+    """Cost [B] of the optimum that is solved anew after each kick (slot, dx [B, nx]), from the unkicked optimum.
+
+    Slots rise; slot k is the time k T / SLOTS. The intervals of `start` are a multiple of SLOTS.
+    """
+    K = start.u.shape[1]
+    if K % SLOTS:
+        raise ValueError(f"the optimum has {K} intervals; expected a multiple of {SLOTS}, where kicks fall")
+    solution, cost, now, per_slot = start, np.zeros(len(start)), 0, K // SLOTS
+    for slot, dx in kicks:
+        node = (slot - now) * per_slot
+        cost += solution.V[:, 0] - solution.V[:, node]
+        x, u = solution.x[:, node] + dx, np.ascontiguousarray(solution.u[:, node:])
+        states, gain = np.ascontiguousarray(solution.x[:, node:]), np.ascontiguousarray(solution.gain[:, node:])
+        ddp, t0 = DDP(ocp, intervals=K - slot * per_slot), slot * ocp.horizon / SLOTS
+        solution, now = better(ddp.solve(x, t0, u=u, x=states, gain=gain), ddp.solve(x, t0, u=u)), slot
+    return cost + solution.cost

@@ -181,9 +181,24 @@ class Report:
     def __str__(self) -> str:
         what = f"{self.ocp.system.name}, {count(len(self.x0), 'initial state')} {self.settings['initial states']}"
         said = [textwrap.fill(sentence, WIDTH, subsequent_indent="  ") for sentence in self.verdict()]
-        return "\n".join([what, "", str(self.summary()), "", *NOTE, "", *said])
+        promised = [textwrap.fill(str(promise), WIDTH, subsequent_indent="  ") for promise in self.promises]
+        return "\n".join([what, "", str(self.summary()), "", *NOTE, "", *self._disturbed(), *promised, *said])
+
+    def _disturbed(self) -> list[str]:
+        """Medians and 95th percentiles of what disturbances cost, as a table in plain text."""
+        if self.robustness is None:
+            return []
+        scenarios = self.robustness.scenarios
+        body = [[s.name, *(f"{_loss(one.lost, 50)} / {_loss(one.lost, 95)}" for one in s.losses)] for s in scenarios]
+        head = ["cost lost %, median / p95", *(one.method for one in scenarios[0].losses)]
+        return [text_table(head, body), ""]
 
     __repr__ = __str__
+
+
+def _loss(lost: Array, q: float) -> str:
+    known = lost[~np.isnan(lost)]
+    return percent(percentile(known, q)) if known.size else "-"
 
 
 def _each_answer(judged: Judged) -> Array:

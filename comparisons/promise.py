@@ -1,0 +1,47 @@
+"""What can be promised from n independent initial states: exact binomial bounds.
+
+Clopper, Pearson (1934), "The use of confidence or fiducial limits illustrated in the case of the binomial",
+Biometrika 26(4): the bounds hold for every n and share, with at least the confidence that they claim.
+"""
+
+from __future__ import annotations
+
+from nocl.comparisons.findings import Promise
+from nocl.comparisons.report import REFERENCE, Report
+
+WITHIN = 2.0  # per cent of the best known cost
+CONFIDENCE = 0.99
+
+
+def lower_bound(successes: int, n: int, confidence: float) -> float:
+    """The largest share p0 that `confidence` allows to claim: P(at least so many successes | p0) = 1 - confidence."""
+    from scipy.stats import beta
+
+    _check(successes, n, confidence)
+    return 0.0 if successes == 0 else float(beta.ppf(1 - confidence, successes, n - successes + 1))
+
+
+def interval(successes: int, n: int, confidence: float) -> tuple[float, float]:
+    """Two-sided bounds of the share, each missed with probability (1 - confidence) / 2 at most."""
+    one_sided = (1 + confidence) / 2
+    return lower_bound(successes, n, one_sided), 1 - lower_bound(n - successes, n, one_sided)
+
+
+def promises(report: Report, within: float = WITHIN, confidence: float = CONFIDENCE) -> tuple[Promise, ...]:
+    """One promise a method. Empty where the states were given: they need to be independent draws.
+
+    A state counts where the run violates nothing and costs at most `within` per cent more than the best known cost,
+    over all methods here: it is a statement about that cost, not about an optimum that nobody found.
+    """
+    if report.settings.get("seed") is None:
+        return ()
+    n, good = len(report.x0), report.within(within).sum(axis=1)
+    return tuple(Promise(j.name, within, confidence, n, int(k), lower_bound(int(k), n, confidence))
+                 for j, k in zip(report.judged, good, strict=True) if j.name != REFERENCE)
+
+
+def _check(successes: int, n: int, confidence: float) -> None:
+    if not 0 <= successes <= n or n < 1:
+        raise ValueError(f"{successes} successes of {n}; expected 0 <= successes <= n and n >= 1")
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence is {confidence!r}; expected a number between 0 and 1, like 0.99")

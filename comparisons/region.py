@@ -1,0 +1,72 @@
+"""The region of initial states where a controller works, mapped by growing their distribution until it fails."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from nocl.checks import Array
+from nocl.comparisons.findings import Region
+from nocl.comparisons.promise import interval
+from nocl.comparisons.reference import Reference
+from nocl.comparisons.report import COST_FLOOR, VIOLATION
+from nocl.ocp import OCP
+from nocl.sampling import Distribution, Gaussian, Uniform
+from nocl.simulate import simulate
+from nocl.solvers.ddp import DDP
+from nocl.solvers.global_search import solve_globally
+
+SCALES = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0)
+HELD = 80  # intervals of the optimum that successes are measured by
+STARTS = 6  # cold starts of that optimum for each state
+
+
+def region(ocp: OCP, name: str, method: Any, scales: Sequence[float] = SCALES, n: int = 50, within: float = 5.0,
+           confidence: float = 0.95, seed: int = 2, progress: bool | None = None) -> Region:
+    """The share of n states that succeed at each scale of the distribution's spread, until more than half fail.
+
+    A run succeeds that reaches the horizon, violates nothing and costs at most `within` per cent more than the best
+    known: its own, or DDP's from cold starts, neighbours and the run itself. Every scale has the same draws, farther
+    out.
+    """
+    if not scales or min(scales) <= 0 or list(scales) != sorted(set(scales)):
+        raise ValueError(f"scales is {scales!r}; expected rising numbers > 0, like (0.5, 1, 2)")
+    states, good = list[Array](), list[Array]()
+    bar = tqdm(scales, desc=f"region of {name}", unit="scale", leave=False,
+               disable=None if progress is None else not progress)
+    for scale in bar:
+        states.append(grown(ocp.initial_states, scale).sample(n, seed))
+        good.append(succeeds(ocp, method, states[-1], within))
+        if good[-1].mean() < 0.5:
+            bar.close()
+            break
+    k = np.array([g.sum() for g in good], dtype=np.int64)
+    bounds = np.array([interval(int(one), n, confidence) for one in k])
+    return Region(name, within, confidence, np.array(scales[: len(k)], dtype=np.float64), k, n, bounds[:, 0],
+                  bounds[:, 1], np.array(states), np.array(good, dtype=bool))
+
+
+def grown(distribution: Distribution, scale: float) -> Distribution:
+    """The same centre, `scale` times the spread."""
+    if isinstance(distribution, Gaussian):
+        return Gaussian(distribution.mean, scale * np.asarray(distribution.std))
+    centre = distribution.centre
+    lb, ub = np.asarray(distribution.lb), np.asarray(distribution.ub)
+    return Uniform(centre + scale * (lb - centre), centre + scale * (ub - centre))
+
+
+def succeeds(ocp: OCP, method: Any, x0: Array, within: float) -> Array:
+    """[B] bool. A state that violates a constraint itself, or that nobody solves, is no success."""
+    run = simulate(ocp, method, x0)
+    own = simulate(ocp, method, x0, hold=HELD).u[:, :-1]
+    cold = solve_globally(DDP(ocp, intervals=HELD), x0, starts=STARTS, seed=0, workers=1, progress=False).best.u
+    rival = Reference(ocp, HELD, [own, cold]).solve(x0)
+    judged = simulate(ocp, rival.u, x0)
+    fair = rival.success & ~(judged.clearance < -VIOLATION)
+    best = np.minimum(run.cost, np.where(fair, judged.cost, np.inf))
+    ok = run.success & ~(run.clearance < -VIOLATION)
+    with np.errstate(invalid="ignore"):
+        return np.asarray(ok & (100 * (run.cost - best) <= within * np.maximum(np.abs(best), COST_FLOOR)))
