@@ -132,7 +132,8 @@ class _Problem:
             R -= Q @ QR
             own = r - (Q @ Qr)[..., 0]
             flat = R.reshape(-1, len(theta))
-            JJ += flat.T @ flat
+            single = flat.float()  # half the time, and damping covers its rounding
+            JJ += (single.T @ single).double()
             Jr += flat.T @ own.reshape(-1)
             A.append(-torch.linalg.solve_triangular(T, QR, upper=True))
             a.append(-torch.linalg.solve_triangular(T, Qr, upper=True)[..., 0])
