@@ -25,6 +25,7 @@ import provenance
 
 import nocl
 from nocl.checks import Array
+from nocl.comparisons.reference import SLOTS, resolved
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
 from nocl.simulate import Simulation, simulate
@@ -34,7 +35,6 @@ from nocl.solvers.ddp import DDP, DDPSolution
 from nocl.solvers.global_search import solve_globally
 
 FINE = 640  # intervals of the reference
-SLOTS = 40  # kicks fall on multiples of the horizon over SLOTS
 
 
 def optimum(ocp: OCP, x0: Array, policy: FeatureNet) -> DDPSolution:
@@ -43,21 +43,6 @@ def optimum(ocp: OCP, x0: Array, policy: FeatureNet) -> DDPSolution:
     found = solve_globally(coarse, x0, starts=8, seed=99).best
     own = policy_controls(policy, nocl.to_torch(ocp.system.f), x0, np.zeros(len(x0)), ocp.horizon, FINE)
     return better(fine.solve(x0, u=np.repeat(found.u, FINE // coarse.intervals, axis=1)), fine.solve(x0, u=own))
-
-
-def kicked_optimum(ocp: OCP, start: DDPSolution, kicks: list[tuple[int, Array]]) -> Array:
-    """Cost [B] of the optimum that is solved anew after each kick (slot, dx), from the unkicked optimum."""
-    solution, cost, now = start, np.zeros(len(start)), 0
-    per_slot = FINE // SLOTS
-    for slot, dx in kicks:
-        node = (slot - now) * per_slot
-        cost += solution.V[:, 0] - solution.V[:, node]
-        x, u = solution.x[:, node] + dx, np.ascontiguousarray(solution.u[:, node:])
-        ddp = DDP(ocp, intervals=FINE - slot * per_slot)
-        states, gain = np.ascontiguousarray(solution.x[:, node:]), np.ascontiguousarray(solution.gain[:, node:])
-        t0 = slot * ocp.horizon / SLOTS
-        solution, now = better(ddp.solve(x, t0, u=u, x=states, gain=gain), ddp.solve(x, t0, u=u)), slot
-    return cost + solution.cost
 
 
 def cost_of_kicks(ocp: OCP, policy: FeatureNet, run: Simulation, kicks: list[tuple[int, Array]]) -> Array:
@@ -93,7 +78,7 @@ def score(ocp: OCP, cnd: nocl.CND, n: int, sigma: float, seed: int = 12345) -> d
     slots = np.sort(rng.choice(np.arange(1, SLOTS - 1), 5, replace=False))
     pushes = [(int(s), sigma * rng.standard_normal(x0.shape)) for s in slots]
     kicked = simulate(ocp, cnd, x0, kicks=[(s * ocp.horizon / SLOTS, dx) for s, dx in pushes])
-    kicked_best = kicked_optimum(ocp, best, pushes)
+    kicked_best = resolved(ocp, best, pushes)
     row["kicked_gap"] = quantiles(kicked.cost / kicked_best - 1)
     lost = (kicked.cost - best.cost - cost_of_kicks(ocp, cnd.policy, kicked, pushes)) / kicked_best
     known = np.isfinite(lost)
