@@ -56,10 +56,15 @@ class Samples:
         return Batch(torch.cat([phi[None], tangents]), torch.cat([y[None], derivatives]))
 
 
-def initial(n_features: int, width: int, samples: Samples, generator: torch.Generator) -> Weights:
-    """Random hidden layers, the linear skip and the offset by least squares, nothing else in the output. float32"""
+def initial(n_features: int, width: int, samples: Samples, generator: torch.Generator,
+            frequency: Tensor | None = None) -> Weights:
+    """Random hidden layers, the linear skip and the offset by least squares, nothing else in the output. float32
+
+    frequency [F] is the standard deviation of each feature's first weights; those of 0 reach the skip alone.
+    """
     h = width
-    W1 = torch.randn(h, n_features + 1, generator=generator) * (1.5 / math.sqrt(n_features))
+    W1 = torch.randn(h, n_features + 1, generator=generator)
+    W1 *= 1.5 / math.sqrt(n_features) if frequency is None else torch.cat([frequency, torch.full((1,), 1.5)]).float()
     W2 = torch.randn(h, h + 1, generator=generator) / math.sqrt(h)
     some = slice(0, 20_000)
     phi = torch.cat([samples.phi[some], torch.ones(len(samples.phi[some]), 1, dtype=samples.phi.dtype)], 1).double()

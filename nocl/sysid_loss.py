@@ -2,7 +2,9 @@
 
 For a batch of B rows, with t_l = W_l a_{l-1} + b_l and a_l = s(t_l) in the hidden layers l = 1, ..., L, y = W a_L + b:
 
-    loss = mean_b |y - f|_2 + mean_b |J - df/dz|_F,    J = W D_L W_L D_{L-1} ... D_1 W_1,    D_l = diag s'(t_l).
+    loss = mean_b |S (y - f)|_2 + mean_b |S_J * (J - df/dz)|_F,   J = W D_L W_L ... D_1 W_1,   D_l = diag s'(t_l)
+
+where S [nx] and, entry by entry, S_J [nx, nz] weigh residuals of normalised labels in physical units.
 
 J is built from the output down (a system has fewer equations than variables), its gradient from the input up. `Loss`
 does this for three layers as compiled C (csrc/paper_loss.h), for others in torch, to rounding the same. In torch, rows
@@ -56,13 +58,15 @@ CURVES: dict[str, Callable[[Tensor], Curve]] = {"sine": _sine, "tanh": _tanh, "r
 class Loss:
     """The loss over given labels (tensors of one float type, float32 or float64) and its gradient, for one MLP.
 
-    theta [P] are its weights, W_1, b_1, ..., W, b by rows in one vector. `compiled`: in C, for three layers of weights;
-    raises ValueError where there is no C compiler.
+    theta [P] are its weights, W_1, b_1, ..., W, b by rows in one vector; scale [nx, 1 + nz] is S beside S_J, ones if
+    None. `compiled`: in C, for three layers of weights; raises ValueError where there is no C compiler.
     """
 
     def __init__(self, sizes: Sequence[int], activation: str, z: Tensor, f: Tensor, jacobian: Tensor | None, *,
-                 compiled: bool) -> None:
+                 compiled: bool, scale: Tensor | None = None) -> None:
         self.activation, self.labels = activation, (z, f, jacobian)
+        self.scale = torch.ones(sizes[-1], 1 + sizes[0], dtype=z.dtype) if scale is None else scale.to(z.dtype)
+        self._scale = torch.cat([self.scale[:, 0], self.scale[:, 1:].flatten()]).numpy()
         self.shapes = [s for n, m in pairwise(sizes) for s in ((m, n), (m,))]
         self.kernel = Kernel(_source(sizes, activation, z.dtype)) if compiled else None
         self._arrays = [None if a is None else a.contiguous().numpy() for a in self.labels]
@@ -74,7 +78,7 @@ class Loss:
         z, f, jacobian = (None if a is None else a[rows] for a in self.labels)
         assert z is not None
         assert f is not None
-        value, parts = loss_and_gradient(self.weights(theta), self.activation, z, f, jacobian)
+        value, parts = loss_and_gradient(self.weights(theta), self.activation, z, f, jacobian, self.scale)
         torch.cat([p.flatten() for p in parts], out=gradient)
         return value
 
@@ -82,7 +86,7 @@ class Loss:
                   gradient: NDArray[np.floating]) -> float:
         assert self.kernel is not None
         value = np.empty(1)
-        self.kernel("nocl_loss", rows, len(rows), theta, *self._arrays, gradient, value)
+        self.kernel("nocl_loss", rows, len(rows), theta, *self._arrays, self._scale, gradient, value)
         if np.isnan(value[0]) and np.isfinite(theta).all():
             raise FloatingPointError("the loss is not a number though the weights are: labels, or memory ran out")
         return float(value[0])
@@ -101,22 +105,22 @@ def _source(sizes: Sequence[int], activation: str, dtype: torch.dtype) -> str:
     return "".join(f"#define {k} {v}\n" for k, v in values.items()) + '#include "paper_loss.h"\n'
 
 
-def loss_and_gradient(weights: Sequence[Tensor], activation: str, z: Tensor, f: Tensor,
-                      jacobian: Tensor | None) -> tuple[float, list[Tensor]]:
-    """(loss, its gradient in each of the weights); `jacobian` None: the loss of values alone."""
+def loss_and_gradient(weights: Sequence[Tensor], activation: str, z: Tensor, f: Tensor, jacobian: Tensor | None,
+                      scale: Tensor) -> tuple[float, list[Tensor]]:
+    """(loss, its gradient in each of the weights); `jacobian` None: the loss of values alone; scale [nx, 1 + nz]."""
     rows = len(z) if jacobian is None else max(BLOCK // (f.shape[1] * weights[0].shape[0]), 16)
     total, gradient = 0.0, [torch.zeros_like(w) for w in weights]
     for at in range(0, len(z), rows):
         block = slice(at, at + rows)
         labels = (z[block], f[block], None if jacobian is None else jacobian[block])
-        total += _block(weights, CURVES[activation], *labels, gradient)
+        total += _block(weights, CURVES[activation], *labels, scale, gradient)
     for g in gradient:
         g /= len(z)
     return total / len(z), gradient
 
 
 def _block(weights: Sequence[Tensor], curve: Callable[[Tensor], Curve], z: Tensor, f: Tensor, jacobian: Tensor | None,
-           gradient: list[Tensor]) -> float:
+           scale: Tensor, gradient: list[Tensor]) -> float:
     """The sum of the loss over a block of rows; its gradient is added to `gradient`."""
     W, b = weights[::2], weights[1::2]
     a, slopes, curvatures = [z], [], []
@@ -125,21 +129,22 @@ def _block(weights: Sequence[Tensor], curve: Callable[[Tensor], Curve], z: Tenso
         a.append(s)
         slopes.append(d)
         curvatures.append(e)
-    error, y_bar = _unit(torch.addmm(b[-1], a[-1], W[-1].T) - f)
+    error, y_bar = _unit(torch.addmm(b[-1], a[-1], W[-1].T) - f, scale[:, 0])
     d_bar: list[Tensor | None] = [None] * len(slopes)
     if jacobian is not None:
         tape = _Jacobian(W, slopes)
-        distance, J_bar = _unit((tape.value - jacobian).flatten(1))
+        distance, J_bar = _unit((tape.value - jacobian).flatten(1), scale[:, 1:].flatten())
         error += distance
         d_bar = tape.backward(J_bar.view_as(jacobian), gradient[::2])
     _backward(W, a, slopes, curvatures, y_bar, d_bar, gradient)
     return error
 
 
-def _unit(r: Tensor) -> tuple[float, Tensor]:
-    """(sum of |r_b|, the rows r_b / |r_b|); a row of zeros stays."""
+def _unit(r: Tensor, scale: Tensor) -> tuple[float, Tensor]:
+    """(sum over rows of |S r_b|, its gradient in the rows); zero for a row of zeros."""
+    r = r * scale
     norm = torch.linalg.vector_norm(r, dim=1, keepdim=True)
-    return float(norm.sum()), r / norm.clamp(min=torch.finfo(r.dtype).tiny)
+    return float(norm.sum()), r / norm.clamp(min=torch.finfo(r.dtype).tiny) * scale
 
 
 def _backward(W: Sequence[Tensor], a: Sequence[Tensor], slopes: Sequence[Tensor], curvatures: Sequence[Tensor | None],

@@ -13,11 +13,13 @@ from nocl import fit
 from nocl.checks import Array
 from nocl.nets import MLP, FeatureNet
 from nocl.structure import Box, Group, Structure
-from nocl.sysid_labels import Pool, Source, draw_pool
+from nocl.sysid_labels import Pool, Source, draw_pool, labelled
 from nocl.sysid_progress import Checkpoint, Progress
 from nocl.sysid_settings import Settings
 
 MAX_POLISHED = 2600  # parameters: beyond, a Levenberg-Marquardt step costs more than it gives
+PROBES = 256  # rows at which the frequencies of the first layer are measured
+SHARE, LEAST = 0.7, 0.5  # of the measured frequencies, as first weights; and the least of these
 FULL_JACOBIAN = 4  # variables up to which every derivative is supervised, beyond it random directions
 
 
@@ -27,17 +29,21 @@ def fit_groups(source: Source, parts: Structure, settings: Settings, seed: int, 
     if not parts.groups:
         return []
     pool = draw_pool(source, parts, settings, np.random.default_rng((seed, 1)))
+    found = None
+    if source.oracle is not None and source.gradients and not settings.angles:
+        found = frequencies(source, parts, pool.z[:PROBES])
     weights = []
     for i in range(len(parts.groups)):
         done = checkpoint.get(i)
-        weights.append(fit_group(source.box, parts, pool, i, settings, seed, bar) if done is None else done)
         if done is None:
-            checkpoint.put(i, weights[-1])
+            done = fit_group(source.box, parts, pool, i, settings, seed, bar, None, found)
+            checkpoint.put(i, done)
+        weights.append(done)
     return weights
 
 
 def fit_group(box: Box, parts: Structure, pool: Pool, index: int, settings: Settings, seed: int,
-               bar: Progress, old: fit.Weights | None = None) -> fit.Weights:
+               bar: Progress, old: fit.Weights | None = None, frequency: list[Tensor] | None = None) -> fit.Weights:
     """Train one network, from `old` weights without SOAP's large steps; its weights in the units of its labels."""
     group = parts.groups[index]
     samples, mean, spread = _samples(box, group, pool, index, settings.angles)
@@ -45,7 +51,8 @@ def fit_group(box: Box, parts: Structure, pool: Pool, index: int, settings: Sett
     draws = Draws(samples, settings.gradient_weight, generator)
     budget = settings.budget(len(group.variables))
     if old is None:
-        weights = fit.initial(samples.phi.shape[1], budget.width, samples, generator)
+        weights = fit.initial(samples.phi.shape[1], budget.width, samples, generator,
+                              None if frequency is None else frequency[index])
     else:
         weights = [old[0], old[1], _scaled(old, -mean / spread, 1 / spread)]
     polish = budget.polish if sum(w.numel() for w in weights) <= MAX_POLISHED else 0
@@ -60,6 +67,29 @@ def fit_group(box: Box, parts: Structure, pool: Pool, index: int, settings: Sett
             weights = fit.levenberg_marquardt(weights, draws, steps=polish, batch=budget.polish_batch, report=report)
     weights = [w.double() for w in weights]
     return [*weights[:2], _scaled(weights, mean, spread)]
+
+
+def frequencies(source: Source, parts: Structure, z: Array) -> list[Tensor]:
+    """First weights by how fast each group's entries change with each variable, in units of its spread. [v] each
+
+    SHARE of the root mean square of d2f / dz2 over that of df / dz about its mean (w for sin(w z)), at least LEAST; 0
+    for variables whose derivatives are constant: they enter linearly, which the skip does. 1 + nz labels a row.
+    """
+    box, found = source.box, []
+    at, step = labelled(source, parts, z), 1e-3 * box.width
+    assert at.gradient is not None
+    moved = [labelled(source, parts, z + step * (np.arange(box.nz) == k)).gradient for k in range(box.nz)]
+    for i, group in enumerate(parts.groups):
+        own, first = list(group.variables), at.gradient[i]  # [N, m, v]
+        weight = 1 / np.maximum(at.value[i].var(axis=0), np.finfo(np.float64).tiny)[:, None]  # entries count alike
+        change = np.stack([other[i][:, :, j] for j, k in enumerate(own) if (other := moved[k]) is not None], axis=2)
+        second = (weight * np.square((change - first) / step[own]).mean(axis=0)).sum(axis=0)
+        varies = (weight * first.var(axis=0)).sum(axis=0)  # [v]
+        unit = _spread(box)[own]
+        linear = varies * unit**2 <= 1e-16
+        ratio = SHARE * unit * np.sqrt(second / np.where(linear, 1.0, varies))
+        found.append(torch.from_numpy(np.where(linear, 0.0, np.maximum(ratio, LEAST))))
+    return found
 
 
 def _scaled(weights: fit.Weights, shift: Array, scale: Array) -> Tensor:

@@ -94,7 +94,7 @@ class PaperSettings:
     lr: float = 0.01
     final_lr: float = 1e-5
     samples: int = 200_000
-    frequency: float = 1.0  # inputs are normalised to this standard deviation; outputs to 1
+    frequency: float = 3.0  # standard deviation of the network's inputs: 3 as of raw states in a box of +-5; outputs: 1
 
     def __post_init__(self) -> None:
         _positive(self, ("width", "iterations", "batch", "samples"), integer=True)

@@ -10,8 +10,10 @@ import torch
 import nocl
 from nocl import fit
 from nocl.data import Dataset
+from nocl.structure import plain
 from nocl.sysid import LearnedDynamics, PaperSettings, Settings, identify
-from nocl.sysid_networks import Draws, weights_of
+from nocl.sysid_labels import Source
+from nocl.sysid_networks import LEAST, PROBES, SHARE, Draws, frequencies, weights_of
 from nocl.systems import acrobot, cartpole, dubins, pendulum, quadrotor
 
 SMALL = Settings(iterations=150, polish=12, polish_batch=256, samples=20_000)
@@ -253,6 +255,16 @@ def test_levenberg_marquardt_lowers_the_residual():
     before, after = (float(fit.loss([w.double() for w in weights], batch, scale)) for weights in (start, end))
     assert after < 1e-4 * before
     assert len(history) == 25
+
+
+def test_first_weights_go_with_the_frequency():
+    """Quadrotor: angles enter as sin, cos; the thrust linearly, but not alone; the rest linearly."""
+    source = Source.of(quadrotor.system(), None, True)
+    z = source.box.sample(PROBES, np.random.default_rng(0))
+    (found,) = frequencies(source, plain(source.box), z)
+    spread = 10 / np.sqrt(12)
+    np.testing.assert_allclose(found[3:6].numpy(), SHARE * spread, rtol=0.1)
+    np.testing.assert_allclose(np.delete(found.numpy(), (3, 4, 5)), [0.0] * 9 + [LEAST] + [0.0] * 3)
 
 
 def test_soap_lowers_the_loss():

@@ -24,12 +24,13 @@ def network(sizes: list[int], activation: str) -> MLP:
     return MLP(sizes, activation).double()
 
 
-def eager(mlp: MLP, z: Tensor, f: Tensor, jacobian: Tensor | None) -> Tensor:
+def eager(mlp: MLP, z: Tensor, f: Tensor, jacobian: Tensor | None, scale: Tensor) -> Tensor:
     """The definition, with the Jacobian by automatic differentiation."""
-    error = (mlp(z) - f).norm(dim=1).mean()
+    error = ((mlp(z) - f) * scale[:, 0]).norm(dim=1).mean()
     if jacobian is None:
         return error
-    return error + (torch.func.vmap(torch.func.jacrev(mlp))(z) - jacobian).flatten(1).norm(dim=1).mean()
+    residual = (torch.func.vmap(torch.func.jacrev(mlp))(z) - jacobian) * scale[:, 1:]
+    return error + residual.flatten(1).norm(dim=1).mean()
 
 
 def test_the_loss_is_the_papers():
@@ -49,10 +50,11 @@ def test_the_loss_is_the_papers():
                                                  ([7, 6, 6, 6, 5], False), ([16, 8, 8, 12], True)])
 def test_the_gradient_is_that_of_autograd(sizes, compiled, activation, gradients):
     mlp, (z, f, J) = network(sizes, activation), labels(sizes[0], sizes[-1])
-    want = eager(mlp, z[ROWS], f[ROWS], J[ROWS] if gradients else None)
+    scale = torch.rand(sizes[-1], 1 + sizes[0], generator=torch.Generator().manual_seed(2), dtype=torch.float64) + 0.5
+    want = eager(mlp, z[ROWS], f[ROWS], J[ROWS] if gradients else None, scale)
     theta = parameters_to_vector(mlp.parameters()).detach()
     parts = torch.autograd.grad(want, list(mlp.parameters()), allow_unused=True, materialize_grads=True)
-    loss = Loss(sizes, activation, z, f, J if gradients else None, compiled=compiled)
+    loss = Loss(sizes, activation, z, f, J if gradients else None, compiled=compiled, scale=scale)
     got = torch.empty_like(theta)
     assert loss(ROWS, theta, got) == pytest.approx(float(want.detach()), rel=1e-12)
     torch.testing.assert_close(got, torch.cat([p.flatten() for p in parts]), rtol=1e-12, atol=1e-14)

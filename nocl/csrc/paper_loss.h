@@ -2,7 +2,8 @@
 
    The includer defines SINGLE (1: float, 0: double), NZ, NX, H (sizes) and CURVE (SINE, TANH, RELU or SILU). With
    t1 = W1 z + b1, a1 = s(t1), t2 = W2 a1 + b2, a2 = s(t2), y = W3 a2 + b3, D = diag s'(t), the loss of a sample is
-   |y - f| + |J - df/dz|, J = W3 D2 W2 D1 W1. One sample a vector lane; a tile is T vectors of samples, few enough to
+   |S (y - f)| + |S_J * (J - df/dz)|, J = W3 D2 W2 D1 W1, entry by entry: what is normalised is weighed in physical
+   units by scale [NX + NX NZ], first S, then S_J by rows. One sample a vector lane; a tile is T vectors of samples, few enough to
    stay in the cache. Matrices of a tile are [rows][T] or, of the Jacobian's part, [rows][C] in rows of LD: column o T + t is
    equation o of vector t. J is built from the output down, its gradient from the input up. */
 #include <math.h>
@@ -207,16 +208,16 @@ static void jacobian(tile *s, const real *w)
     product(NZ, H, w, 1, NZ, C, LD, s->G1, s->J);
 }
 
-/* Residuals x - label [rows][NX T] in rows of ld, each sample's divided by their norm; 0 in lanes beyond `left`.
-   Returns the sum of the norms. */
-INLINE real units(int rows, int ld, vec *x, const vec *label, int64_t left)
+/* The gradient of each sample's |scale (x - label)|, into x [rows][NX T] in rows of ld; 0 in lanes beyond `left`.
+   Row r, equation o has scale[r + o stride]. Returns the sum of the norms. */
+INLINE real units(int rows, int ld, vec *x, const vec *label, const real *scale, int stride, int64_t left)
 {
     real total = 0;
     vec square[T];
     for (int t = 0; t < T; ++t) square[t] = (vec){0};
     for (int r = 0; r < rows; ++r)
         for (int c = 0; c < C; ++c) {
-            x[r * ld + c] -= label[r * ld + c];
+            x[r * ld + c] = (x[r * ld + c] - label[r * ld + c]) * scale[r + c / T * stride];
             square[c % T] += x[r * ld + c] * x[r * ld + c];
         }
     for (int t = 0; t < T; ++t)
@@ -227,7 +228,7 @@ INLINE real units(int rows, int ld, vec *x, const vec *label, int64_t left)
             square[t][lane] = own && norm > 0 ? 1 / norm : 0;
         }
     for (int r = 0; r < rows; ++r)
-        for (int c = 0; c < C; ++c) x[r * ld + c] *= square[c % T];
+        for (int c = 0; c < C; ++c) x[r * ld + c] *= square[c % T] * scale[r + c / T * stride];
     return total;
 }
 
@@ -291,7 +292,7 @@ static void values_backward(tile *s, const real *w, real *g, int with_jacobian)
 /* The mean of the loss over rows at[0 .. n - 1] and its gradient g [PARAMETERS]; dfdz NULL: of the values alone.
    All rows are taken, whatever the blocks; loss is NaN where there is no memory. */
 void nocl_loss(int64_t first_block, int64_t last_block, const int64_t *at, int64_t n, const real *w, const real *z,
-               const real *f, const real *dfdz, real *g, double *loss)
+               const real *f, const real *dfdz, const real *scale, real *g, double *loss)
 {
     (void)first_block, (void)last_block;
     tile *s = aligned_alloc(BYTES, sizeof(tile));
@@ -302,10 +303,10 @@ void nocl_loss(int64_t first_block, int64_t last_block, const int64_t *at, int64
         const int64_t left = n - first;
         load(s, at + first, left, z, f, dfdz);
         values(s, w);
-        *loss += units(1, C, s->y, s->f, left) / n;
+        *loss += units(1, C, s->y, s->f, scale, 1, left) / n;
         if (dfdz) {
             jacobian(s, w);
-            *loss += units(NZ, LD, s->J, s->dfdz, left) / n;
+            *loss += units(NZ, LD, s->J, s->dfdz, scale + NX, NZ, left) / n;
             jacobian_backward(s, w, g);
         }
         values_backward(s, w, g, dfdz != 0);

@@ -1,0 +1,181 @@
+"""System identification, measured: training speed, errors against the number of labels, Table I kept.
+
+    python benchmarks/sysid.py speed      # samples per second beside plain PyTorch -> results/sysid_speed.json
+    python benchmarks/sysid.py samples    # error by labels -> results/sysid_samples.json, docs/sysid_samples.png
+    python benchmarks/sysid.py table RUN  # the cells of `nocl reproduce sysid --out RUN` -> results/sysid.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import provenance
+import torch
+from torch import Tensor
+
+from nocl import store
+from nocl.comparisons.reproduce import sysid
+from nocl.data import Dataset
+from nocl.nets import MLP
+from nocl.sysid import Settings, identify
+from nocl.sysid_loss import Loss
+from nocl.systems import load_ocp
+
+BATCH, WIDTH, ROWS = 1024, 64, 100_000
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+LABELS = (100, 300, 1000, 3000, 10_000, 30_000, 100_000)
+SMALL = Settings(width=32, iterations=800, batch=512, polish=30, polish_batch=512)  # the same at every number of labels
+
+Step = Callable[[], None]
+
+
+def speed(rounds: int, steps: int) -> None:
+    """One training step, all with Adam and one thread: interleaved, the median over rounds."""
+    torch.set_num_threads(1)
+    rows = []
+    for name in sysid.SYSTEMS:
+        steppers = dict(contestants(name))
+        for step in steppers.values():
+            step()
+        seconds: dict[str, list[float]] = {key: [] for key in steppers}
+        for _ in range(rounds):
+            for key, step in steppers.items():
+                start = time.perf_counter()
+                for _ in range(steps):
+                    step()
+                seconds[key].append((time.perf_counter() - start) / steps)
+        per_second = {key: round(BATCH / float(np.median(s))) for key, s in seconds.items()}
+        best = max(per_second["eager, vmap(jacrev)"], per_second["eager, autograd.grad a row"])
+        rows.append({"system": name, "samples_per_second": per_second, "times": round(per_second["nocl"] / best, 2)})
+        print(rows[-1], flush=True)
+    provenance.write("sysid_speed", rows, batch=BATCH, width=WIDTH, rounds=rounds, steps=steps, threads=1,
+                     loss="|f_theta - f| + |grad f_theta - grad f|, full Jacobian, sine, 3 layers, float32")
+
+
+def contestants(name: str) -> Iterator[tuple[str, Step]]:
+    """Training steps on the same labels: ours, and eager PyTorch in the two ways that people write."""
+    data = Dataset.sample(load_ocp(name).system, ROWS, 0)
+    assert data.A is not None
+    assert data.B is not None
+    arrays = (np.hstack([data.x, data.u]), data.xdot, np.concatenate([data.A, data.B], axis=2))
+    z, f, jacobian = (torch.from_numpy(a).float() for a in arrays)
+    sizes = [z.shape[1], WIDTH, WIDTH, f.shape[1]]
+    theta = torch.nn.utils.parameters_to_vector(MLP(sizes, "sine").parameters()).detach()
+    loss = Loss(sizes, "sine", z, f, jacobian, compiled=True)
+    theta.grad = torch.zeros_like(theta)
+    optimizer = torch.optim.Adam([theta], lr=1e-3, fused=True)
+
+    def ours() -> None:
+        assert theta.grad is not None
+        loss(torch.randint(ROWS, (BATCH,)), theta, theta.grad)
+        optimizer.step()
+
+    yield "nocl", ours
+    for title, jacobian_of in (("eager, vmap(jacrev)", _vmap), ("eager, autograd.grad a row", _loop)):
+        yield title, _eager(MLP(sizes, "sine"), jacobian_of, z, f, jacobian)
+
+
+def _eager(mlp: MLP, jacobian_of: Callable[[MLP, Tensor], tuple[Tensor, Tensor]], z: Tensor, f: Tensor,
+           jacobian: Tensor) -> Step:
+    optimizer = torch.optim.Adam(mlp.parameters(), lr=1e-3)
+
+    def step() -> None:
+        rows = torch.randint(ROWS, (BATCH,))
+        value, slope = jacobian_of(mlp, z[rows])
+        loss = (value - f[rows]).norm(dim=1).mean() + (slope - jacobian[rows]).flatten(1).norm(dim=1).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+
+    return step
+
+
+def _vmap(mlp: MLP, z: Tensor) -> tuple[Tensor, Tensor]:
+    return mlp(z), torch.func.vmap(torch.func.jacrev(mlp))(z)
+
+
+def _loop(mlp: MLP, z: Tensor) -> tuple[Tensor, Tensor]:
+    z = z.requires_grad_()
+    y = mlp(z)
+    rows = [torch.autograd.grad(y[:, i].sum(), z, create_graph=True)[0] for i in range(y.shape[1])]
+    return y, torch.stack(rows, 1)
+
+
+def samples(systems: list[str], labels: list[int]) -> None:
+    """Mean error of nocl's recipe and of the plain network, with and without Jacobian labels, on the same rows."""
+    rows: list[dict[str, Any]] = []
+    for name in systems:
+        system = load_ocp(name).system
+        for n in labels:
+            data = Dataset.sample(system, n, 7)
+            for method in ("default", "mlp"):
+                for gradients in (True, False):
+                    model = identify(system, data=data, method=method, gradients=gradients, settings=SMALL,
+                                     progress=False)
+                    score = model.score(5000)
+                    rows.append({"system": name, "labels": n, "method": method, "gradients": gradients,
+                                 "mean": score.mean, "median": score.median, "jacobian": score.jacobian,
+                                 "seconds": model.card["seconds"]})
+                    print(rows[-1], flush=True)
+    kept = provenance.RESULTS / "sysid_samples.json"
+    others = [r for r in store.read_json(kept)["rows"] if r["system"] not in systems] if kept.exists() else []
+    provenance.write("sysid_samples", [*others, *rows], settings=asdict(SMALL))
+    draw([*others, *rows], DOCS / "sysid_samples.png")
+
+
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
+    """Mean error against labels, a panel for each system: filled with Jacobians, open without."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    from nocl.comparisons.style import COLOURS, STYLE, encode
+
+    systems = list(dict.fromkeys(r["system"] for r in rows))
+    with matplotlib.rc_context(STYLE):
+        drawing = Figure(figsize=(4 * len(systems), 3.2), layout="constrained")
+        panels = drawing.subplots(1, len(systems), squeeze=False)[0]
+        for system, axes in zip(systems, panels, strict=True):
+            for colour, method, title in ((COLOURS[0], "default", "structure first"), (COLOURS[1], "mlp", "plain")):
+                for gradients in (True, False):
+                    own = [r for r in rows if (r["system"], r["method"], r["gradients"]) == (system, method, gradients)]
+                    axes.plot([r["labels"] for r in own], [r["mean"] for r in own], "o-" if gradients else "s--",
+                              color=colour, ms=4, mfc=colour if gradients else "none",
+                              label=f"{title}, {'with' if gradients else 'without'} Jacobians")
+            axes.set(xscale="log", yscale="log", title=system, xlabel="labelled samples",
+                     ylabel="mean of ||f_theta - f||")
+        panels[0].legend(fontsize=7)
+        store.write_bytes(path, encode(drawing, "png"))
+
+
+def table(run: Path) -> None:
+    """Finished cells, with what they were made with."""
+    provenance.write("sysid", [asdict(cell) for cell in sysid.finished(run)], held_out=sysid.HELD_OUT)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    commands = parser.add_subparsers(dest="command", required=True)
+    one = commands.add_parser("speed")
+    one.add_argument("--rounds", type=int, default=15)
+    one.add_argument("--steps", type=int, default=10)
+    one = commands.add_parser("samples")
+    one.add_argument("--systems", nargs="+", default=["cartpole", "acrobot"])
+    one.add_argument("--labels", nargs="+", type=int, default=LABELS)
+    commands.add_parser("table").add_argument("run", type=Path)
+    args = parser.parse_args()
+    if args.command == "speed":
+        speed(args.rounds, args.steps)
+    elif args.command == "samples":
+        samples(args.systems, args.labels)
+    else:
+        table(args.run)
+
+
+if __name__ == "__main__":
+    main()
