@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 if TYPE_CHECKING:
     from nocl.ocp import OCP
 
-METHODS = ("CND", "NMPC", "LQR", "DDP")
+METHODS = ("CND", "NMPC", "NMPC-LOOP", "LQR", "DDP")
 SOLVERS = ("nmpc", "ddp", "lqr")
 FORMS = ("casadi", "l4casadi", "onnx", "c")
 QUICK_PROOF = ("casadi", "onnx", "c")  # of a run: L4CasADi takes half a minute to build
@@ -96,9 +96,34 @@ def parser() -> argparse.ArgumentParser:
     sub = command("compare", _compare, "compare a run's controller with other methods, initial state by initial state")
     _add(sub, "run", "n", "intervals", "methods")
     sub.add_argument("--seed", type=_seed, help="of the initial states; default: the seed of the run")
-    sub.add_argument("--hold", type=_count, metavar="K", help="judge feedback once more, held on K intervals")
+    sub.add_argument("--hold", type=_holds, metavar="K", help="judge feedback once more, held on K intervals; or K,L")
+    sub.add_argument("--robust", action="store_true", help="also noise, kicks, late and held controls, wrong masses, "
+                     "real time, and the region of initial states that works; takes minutes")
     sub.add_argument("--out", type=_folder, metavar="DIR", help="default: RUN/report")
+    sub = command("reproduce", _nothing, "make a table of the paper again, its published numbers beside ours")
+    _add_tables(sub)
     return top
+
+
+def _add_tables(sub: argparse.ArgumentParser) -> None:
+    """`nocl reproduce TABLE`: a subcommand each."""
+    tables = sub.add_subparsers(title="tables", metavar="TABLE", required=True)
+
+    def table(name: str, run: Callable[[argparse.Namespace], None], text: str) -> argparse.ArgumentParser:
+        one = tables.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
+        one.set_defaults(command=run)
+        one.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        one.add_argument("--out", type=_folder, default=Path("runs") / f"reproduce-{name}", metavar="DIR",
+                         help=f"default: runs/reproduce-{name}; what is finished there is not made again")
+        one.add_argument("--quick", action="store_true", help="small budgets: to see whether it works, not how well")
+        return one
+
+    one = table("sysid", _reproduce_sysid, "Table I: the error of learned dynamics by activation and supervision")
+    one.add_argument("--seeds", type=_count, metavar="K", help="networks a cell; default: 3, with --quick 1")
+    one.add_argument("--iterations", type=_count, metavar="N",
+                     help="of Adam in the paper's own ways; default: 50000, with --quick 1000")
+    one.add_argument("--systems", type=_words, metavar="A,B", help="default: all four")
+    one.add_argument("--ways", type=_words, metavar="A,B", help="rows, like sine-gradients,nocl; default: all nine")
 
 
 def _add(sub: argparse.ArgumentParser, *names: str) -> None:
@@ -148,6 +173,15 @@ def _folder(text: str) -> Path:
     return Path(text)
 
 
+def _words(text: str) -> tuple[str, ...]:
+    return tuple(word.strip() for word in text.split(","))
+
+
+def _holds(text: str) -> tuple[int | None, ...]:
+    """Rates of feedback: continuous, and each number of intervals."""
+    return (None, *(_count(word.strip()) for word in text.split(",")))
+
+
 def _methods(text: str) -> tuple[str, ...]:
     names = tuple(word.strip().upper() for word in text.split(","))
     if not set(names) <= set(METHODS) or len(set(names)) < len(names):
@@ -160,6 +194,23 @@ def _forms(text: str) -> tuple[str, ...]:
     if not set(names) <= set(FORMS):
         raise argparse.ArgumentTypeError(f"{text!r} is not a list of {', '.join(FORMS)}")
     return names
+
+
+def _nothing(args: argparse.Namespace) -> None:
+    """Of a command whose subcommands do the work."""
+
+
+def _reproduce_sysid(args: argparse.Namespace) -> None:
+    from nocl.comparisons.reproduce import sysid, sysid_tables
+
+    seeds, iterations = args.seeds or (1 if args.quick else 3), args.iterations or (1000 if args.quick else 50_000)
+    plan = sysid.Plan(iterations, seeds, args.systems or sysid.SYSTEMS, args.ways or sysid.Plan.ways, args.quick)
+    _check_out(args.out)
+    sysid.run(args.out, plan)
+    cells = sysid.finished(args.out)
+    paths = sysid_tables.write(args.out, cells)
+    print(sysid_tables.markdown(sysid.table(cells)), end="")
+    print("written:", ", ".join(map(str, paths)))
 
 
 def _list(args: argparse.Namespace) -> None:
@@ -274,7 +325,7 @@ def _compare(args: argparse.Namespace) -> None:
     _check_out(out)
     _other_methods(cnd.ocp, args.methods, args.intervals)
     seed = int(cnd.card.get("seed", 0)) if args.seed is None else args.seed
-    Stages(cnd.ocp, run, seed, False).compare(cnd, out, args.methods, args.n, args.intervals, args.hold)
+    Stages(cnd.ocp, run, seed, False).compare(cnd, out, args.methods, args.n, args.intervals, args.hold, args.robust)
 
 
 def _other_methods(ocp: OCP, methods: Sequence[str], intervals: int) -> None:
