@@ -9,8 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,6 +19,9 @@ from numpy.typing import ArrayLike
 from nocl.checks import Array
 from nocl.log_files import Table, read_table, write_table
 from nocl.system import System, counted
+
+if TYPE_CHECKING:
+    from nocl.smoothing import Smooth
 
 TIME, RUN = "t", "run"
 LEAST = 5  # samples of a piece: fewer have no smoothed derivative
@@ -35,6 +39,13 @@ class Run:
 
     def __len__(self) -> int:
         return len(self.t)
+
+    @cached_property
+    def smooth(self) -> Smooth:
+        """Smoothed states and derivatives (nocl.smoothing)."""
+        from nocl.smoothing import smooth
+
+        return smooth(self.t, self.x)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -27,7 +27,7 @@ from nocl.checks import Array
 from nocl.integrate import rk4_interval
 from nocl.logs import Log
 from nocl.nets import FeatureNet
-from nocl.smoothing import Smooth, noise
+from nocl.smoothing import noise
 
 NOISE_FLOOR = 1e-3  # of a state's spread: logs without noise would weigh rounding
 CHUNK = 50  # windows whose sensitivities are held at a time
@@ -46,15 +46,15 @@ class Windows:
     noise: Tensor  # [nx], what residuals are measured in
 
     @staticmethod
-    def of(log: Log, smoothed: list[Smooth], m: int, most: int, rng: np.random.Generator) -> Windows:
+    def of(log: Log, m: int, most: int, rng: np.random.Generator) -> Windows:
         """All windows of m steps of a log, or `most` of them at random."""
         pieces = []
-        for run, s in zip(log, smoothed, strict=True):
-            pieces += [_window(run.t, run.x, run.u, s.x, k, m) for k in range(0, len(run) - 1, m)]
+        for run in log:
+            pieces += [_window(run.t, run.x, run.u, run.smooth.x, k, m) for k in range(0, len(run) - 1, m)]
         if len(pieces) > most:
             pieces = [pieces[i] for i in rng.permutation(len(pieces))[:most]]
         start, x, u, h = (np.stack(p) for p in zip(*pieces, strict=True))
-        sigma = np.hypot(noise(smoothed), NOISE_FLOOR * spread_of(np.concatenate([s.x for s in smoothed])))
+        sigma = np.hypot(noise(log), NOISE_FLOOR * spread_of(np.concatenate([r.smooth.x for r in log])))
         there = np.isfinite(x)
         arrays = (start, np.where(there, x, 0.0), there.astype(float), u, h[..., None], sigma)
         return Windows(*(torch.from_numpy(np.ascontiguousarray(a)) for a in arrays))

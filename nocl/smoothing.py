@@ -7,7 +7,6 @@ in the middle between two samples, where it belongs to the one control held ther
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,12 +27,12 @@ class Smooth:
     residual: Array  # [K+1, nx], logged minus smoothed, NaN where a sample is missing
 
 
-def smooth(run: Run) -> Smooth:
-    """One run, state by state."""
-    middle = (run.t[:-1] + run.t[1:]) / 2
-    columns = [_spline(run.t, run.x[:, i], middle) for i in range(run.x.shape[1])]
-    x, mid, xdot = (np.column_stack([c[k] for c in columns]) for k in range(3))
-    return Smooth(x, mid, xdot, run.x - x)
+def smooth(t: Array, x: Array) -> Smooth:
+    """One run, state by state: t [K+1], x [K+1, nx], NaN where a sample is missing. `Run.smooth` keeps the answer."""
+    middle = (t[:-1] + t[1:]) / 2
+    columns = [_spline(t, x[:, i], middle) for i in range(x.shape[1])]
+    states, mid, xdot = (np.column_stack([c[k] for c in columns]) for k in range(3))
+    return Smooth(states, mid, xdot, x - states)
 
 
 def _spline(t: Array, x: Array, middle: Array) -> tuple[Array, Array, Array]:
@@ -47,20 +46,20 @@ def _spline(t: Array, x: Array, middle: Array) -> tuple[Array, Array, Array]:
     return offset + scale * spline(at), offset + scale * spline(mid), scale / unit * spline.derivative()(mid)
 
 
-def noise(smoothed: Sequence[Smooth]) -> Array:
+def noise(log: Log) -> Array:
     """The root mean square of what smoothing took away, for each state [nx]."""
-    return np.sqrt(np.nanmean(np.square(np.concatenate([s.residual for s in smoothed])), axis=0))
+    return np.sqrt(np.nanmean(np.square(np.concatenate([r.smooth.residual for r in log])), axis=0))
 
 
 def dataset(log: Log) -> Dataset:
     """The log as labels without Jacobians: logged derivatives where there are any, else smoothed ones."""
-    x, u, xdot = zip(*(labels(run, smooth(run)) for run in log), strict=True)
+    x, u, xdot = zip(*map(labels, log), strict=True)
     return Dataset(np.concatenate(x), np.concatenate(u), np.concatenate(xdot))
 
 
-def labels(run: Run, smoothed: Smooth) -> tuple[Array, Array, Array]:
+def labels(run: Run) -> tuple[Array, Array, Array]:
     """(x, u, xdot) of one run, a row for each label."""
     if run.xdot is None:
-        return smoothed.middle, run.u, smoothed.xdot
+        return run.smooth.middle, run.u, run.smooth.xdot
     there = np.isfinite(run.xdot[:-1]).all(axis=1) & np.isfinite(run.x[:-1]).all(axis=1)
     return run.x[:-1][there], run.u[there], run.xdot[:-1][there]

@@ -18,7 +18,7 @@ from nocl.checks import Array
 from nocl.logs import Log, Run
 from nocl.nets import MLP, FeatureNet
 from nocl.shooting import Windows, fit_simulation, spread_of
-from nocl.smoothing import labels, smooth
+from nocl.smoothing import labels
 from nocl.structure import Structure
 from nocl.sysid_networks import assemble
 from nocl.sysid_progress import Progress
@@ -29,15 +29,14 @@ MEMORY = 30  # of L-BFGS
 
 def fit_log(log: Log, parts: Structure, settings: LogSettings, seed: int, bar: Progress) -> FeatureNet:
     """f_theta of the given structure, fitted to a log."""
-    smoothed = [smooth(run) for run in log]
-    x, u, xdot = (np.concatenate(a) for a in zip(*map(labels, log, smoothed), strict=True))
+    x, u, xdot = (np.concatenate(a) for a in zip(*map(labels, log), strict=True))
     net = assemble(parts, initial(parts, settings, seed), settings.angles)
     if not parts.groups:
         return net
     unit = output_units(parts, net, xdot)
     fit_derivatives(net, unit, x, u, xdot, settings, bar)
     if settings.steps:
-        windows = Windows.of(log, smoothed, settings.window, settings.windows, np.random.default_rng((seed, 3)))
+        windows = Windows.of(log, settings.window, settings.windows, np.random.default_rng((seed, 3)))
         with bar.stage("simulation error", settings.steps) as report:
             fit_simulation(net, unit, windows, steps=settings.steps, substeps=settings.substeps, ridge=settings.ridge,
                            report=report)
@@ -46,7 +45,7 @@ def fit_log(log: Log, parts: Structure, settings: LogSettings, seed: int, bar: P
 
 def first_states(log: Log) -> list[tuple[Array, Run]]:
     """Each run with its smoothed states at all samples but the last."""
-    return [(smooth(run).x[:-1], run) for run in log]
+    return [(run.smooth.x[:-1], run) for run in log]
 
 
 def initial(parts: Structure, settings: LogSettings, seed: int) -> list[fit.Weights]:

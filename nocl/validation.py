@@ -12,7 +12,6 @@ import torch
 from nocl.checks import Array
 from nocl.integrate import rk4_interval
 from nocl.logs import Log, Run
-from nocl.smoothing import smooth
 from nocl.threads import one_thread
 
 if TYPE_CHECKING:
@@ -92,7 +91,7 @@ def validate(f: Field, log: Log, steps: Sequence[int] = HORIZONS, every: int | N
     if not wanted:
         raise ValueError(f"steps is {tuple(steps)}; expected numbers of steps from 1 to {longest}, the longest run's")
     stride = max(len(log) // 2000, 1) if every is None else every
-    starts = {"logged": [r.x for r in log], "smoothed": [smooth(r).x for r in log]}
+    starts = {"logged": [r.x for r in log], "smoothed": [r.smooth.x for r in log]}
     single = {name: _errors(f, log, x, (wanted[0],), stride, substeps) for name, x in starts.items()}
     chosen = min(single, key=lambda name: float(np.square(_rms(single[name].errors[0]) / _spread(log)).sum()))
     found = _errors(f, log, starts[chosen], wanted, stride, substeps)

@@ -12,7 +12,7 @@ import nocl
 from nocl.cli import main
 from nocl.coverage import Coverage
 from nocl.logs import Log
-from nocl.smoothing import dataset, noise, smooth
+from nocl.smoothing import dataset, noise
 from nocl.solvers.ddp import DDP
 from nocl.sysid import LearnedDynamics, LogSettings, identify
 from nocl.systems import cartpole, pendulum
@@ -151,7 +151,7 @@ def test_smoothing_finds_the_noise_and_the_derivative():
     t, rng = np.arange(400) * 0.02, np.random.default_rng(0)
     x = np.column_stack([np.sin(2 * t), 2 * np.cos(2 * t)])
     log = Log.of(oscillator(), t, x + 0.01 * rng.standard_normal(x.shape), np.zeros(400))
-    assert noise([smooth(log.runs[0])]) == pytest.approx([0.01, 0.01], rel=0.1)
+    assert noise(log) == pytest.approx([0.01, 0.01], rel=0.1)
     xdot = dataset(log).xdot
     middle = t[:-1] + 0.01
     error = xdot - np.column_stack([2 * np.cos(2 * middle), -4 * np.sin(2 * middle)])

@@ -7,7 +7,6 @@ import torch
 from nocl.known import Stated
 from nocl.logs import Log
 from nocl.shooting import Windows, _Problem, fit_simulation
-from nocl.smoothing import smooth
 from nocl.sysid_labels import box_of
 from nocl.sysid_logs import initial
 from nocl.sysid_networks import assemble
@@ -28,7 +27,7 @@ def problem(substeps: int = 1, ridge: float = 0.0, n: int = 12) -> _Problem:
     weights[0][2] = torch.from_numpy(0.3 * rng.standard_normal(weights[0][2].shape))
     net = assemble(parts, weights, True)
     unit = torch.from_numpy(rng.uniform(0.5, 2.0, sum(p.numel() for p in net.parameters())))
-    windows = Windows.of(log, [smooth(r) for r in log], 4, 100, rng)
+    windows = Windows.of(log, 4, 100, rng)
     return _Problem(net, unit, windows, substeps, ridge)
 
 
