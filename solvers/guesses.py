@@ -184,12 +184,12 @@ def _coupled(ocp: OCP) -> NDArray[np.int32]:
     s = ocp.system
     n, z = s.nx, ca.vertcat(s.x, s.u)
     H = ca.hessian(ocp.running, z)[0] + ca.diagcat(ca.hessian(ocp.terminal, s.x)[0], ca.SX(s.nu, s.nu))
-    links = ca.Function("links", [s.x, s.u], [ca.jacobian(s.xdot, z), H])
+    links = ca.Function("links", [s.x, s.u], [ca.jacobian(s.f(s.x, s.u), z), H])
     A, H = (part.full() for part in links(ocp.x_goal, ocp.u_goal))
     scale = np.r_[s.ubx - s.lbx, s.ubu - s.lbu]
     A, H = np.abs(A * scale) / scale[:n, None], np.abs(H * np.outer(scale, scale))
     H[:n] += A
-    return np.asarray(connected_components(H > ROUNDING * H.max(), directed=False)[1])
+    return np.asarray(connected_components(ROUNDING * H.max() < H, directed=False)[1])
 
 
 def mirrored(ocp: OCP, mirror: tuple[Array, Array], x: Array, u: Array) -> Guess:

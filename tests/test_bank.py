@@ -76,7 +76,7 @@ def test_a_mirror_image_has_the_mirrored_answer():
 
 
 def test_a_pole_that_can_be_caught_is():
-    """Random controls of the unstable pole, in open loop, rarely stumble on the catch that the held goal starts from."""
+    """Random controls, in open loop, rarely stumble on the catch that the held goal starts from."""
     x0 = [[1.04, -0.03, -1.39, 3.44]]
     assert solve_globally(cartpole(), x0, starts=2, rounds=0).best.cost[0] < 0.01
     blind = cartpole().solve(np.repeat(x0, 20, axis=0), u=cold_controls(cartpole(), 20, 0))
