@@ -13,7 +13,7 @@ PACKAGES = {"systems": "nocl.systems", "solvers": "nocl.solvers", "comparisons":
 CHAIN = ["lqr", "nmpc", "ddp", "cnd"]  # a solver may use those before it
 # files that are part of a link of the chain
 PARTS = {**dict.fromkeys(("transcription", "guesses", "search", "pool", "sensitivity", "loop", "compiled"), "nmpc"),
-         **dict.fromkeys(("ddp_kernel", "ddp_batch", "bank", "global_search"), "ddp")}
+         **dict.fromkeys(("ddp_kernel", "ddp_numpy", "ddp_batch", "bank", "global_search"), "ddp")}
 MAY_IMPORT = {"core": {"core"}, "systems": {"core", "systems"}, "solvers": {"core", "solvers"},
               "comparisons": {"core", "systems", "solvers", "comparisons"},
               "top": {"core", "systems", "solvers", "comparisons", "top"}}
