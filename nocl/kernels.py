@@ -77,6 +77,10 @@ def _operation(op: str, args: list[str], function: str) -> str:
     return template.format(*args)
 
 
+class NoCompilerError(ValueError):
+    """There is no C compiler on this machine."""
+
+
 class Kernel:
     """A compiled library of source that includes lanes.h: its functions take (first block, last block, index, ...)."""
 
@@ -118,14 +122,15 @@ def _c(value: object) -> Any:
 
 
 def _compiler() -> list[str]:
-    """The command of the C compiler: $CC, or else gcc or cc; ValueError where there is none."""
+    """The command of the C compiler: $CC, or else gcc or cc; NoCompilerError where there is none."""
     named = shlex.split(os.environ.get("CC", ""))
     for command in [named] if named else [["gcc"], ["cc"]]:
         path = shutil.which(command[0])
         if path:
             return [path, *command[1:]]
     looked = f"CC={named[0]}" if named else "gcc, cc"
-    raise ValueError(f"no C compiler found (looked for {looked}), and kernels are C: install gcc, or name one in CC")
+    raise NoCompilerError(f"no C compiler found (looked for {looked}), and kernels are C: install gcc, or name one in "
+                          "CC")
 
 
 @lru_cache

@@ -24,11 +24,11 @@ from numpy.typing import ArrayLike
 
 from nocl import checks
 from nocl.checks import Array
-from nocl.kernels import Kernel
 from nocl.ocp import OCP
 from nocl.solvers.compiled import fingerprint
 from nocl.solvers.ddp_batch import Batch, DDPSolution, Job, Rows, assembled, pieces
 from nocl.solvers.ddp_kernel import ddp_source, pack_weights
+from nocl.solvers.ddp_numpy import ddp_kernel
 from nocl.solvers.pool import Journal, Pool, stream
 
 if TYPE_CHECKING:
@@ -85,7 +85,7 @@ class DDP:
         self.dynamics, self.cache = dynamics, cache
         net = None if dynamics is None else _fitting(ocp, dynamics)
         self._weights = np.zeros(1) if net is None else pack_weights(net)
-        self._kernel = Kernel(ddp_source(ocp, net), cache)
+        self._kernel = ddp_kernel(ocp, dynamics, cache)
         self._lb, self._ub = np.ascontiguousarray(ocp.system.lbu), np.ascontiguousarray(ocp.system.ubu)
 
     def __getstate__(self) -> dict[str, Any]:

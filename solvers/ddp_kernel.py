@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import combinations_with_replacement, pairwise
 from typing import Any
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from nocl.checks import Array
 from nocl.kernels import emit
 from nocl.ocp import OCP
 
+STRAIGHT = 20_000  # products in the chain rule through a step, up to which it is straight-line code
 ACTIVATION_KINDS = {"sine": 0, "tanh": 1, "relu": 2, "silu": 3}  # as csrc/mlp.h numbers them
 Columns = list[ca.SX]
+_STEP = """#define NZ (N + M)
+static const double reach[4] = {0, 0.5, 0.5, 1}, share[4] = {1. / 6, 1. / 3, 1. / 3, 1. / 6};
+"""
 
 
 def pack_weights(net: Any) -> Array:
@@ -37,12 +42,12 @@ def ddp_source(ocp: OCP, net: Any = None) -> str:
     sizes = {"N": x.numel(), "M": u.numel(), "NET": networks.numel(), "TAPE": sum(n.tape for n in nets),
              "NV": stage.v.numel(), "BEND": stage.bend.numel(), "NJ": stage.J.nnz(), "NW": stage.W.nnz()}
     lines = ['#include "lanes.h"', *(['#include "mlp.h"'] if nets else []),
-             *(f"#define {name} {value}" for name, value in sizes.items()), _networks(x, u, nets),
+             *(f"#define {name} {value}" for name, value in sizes.items()), _STEP, _networks(x, u, nets),
              emit("field", [x, u, networks], [ca.densify(stage.rhs)]),
-             emit("stage_jacobian", [x, u, networks], [stage.J]),
+             emit("stage_jacobian", [x, u, networks], [stage.J.T]),
              emit("network_weights", [x, u, networks, stage.mu], [stage.v]),
              emit("stage_hessian", [x, u, networks, stage.bend, stage.mu], [stage.W]),
-             *_chain(x.numel(), u.numel(), stage.J.sparsity(), stage.W.sparsity())]
+             _chain(x.numel(), u.numel(), stage.J.sparsity(), stage.W.sparsity())]
     G = ocp.terminal
     H, g = ca.hessian(G, x)
     lines.append(emit("terminal", [x], [ca.densify(G), ca.densify(g), ca.densify(H)]))
@@ -51,7 +56,7 @@ def ddp_source(ocp: OCP, net: Any = None) -> str:
 
 
 class _Net:
-    """One network as symbols: its values and slopes along q directions; its Hessian and adjoint for weights on the values.
+    """One network as symbols: values and slopes along q directions; Hessian and adjoint for weights on the values.
 
     The directions are the variables in z that its features depend on, or the features where those are fewer.
     """
@@ -64,11 +69,12 @@ class _Net:
         self.directions = z[variables] if few else phi
         self.seeds = ca.densify(ca.jacobian(phi, z)[:, variables] if few else ca.SX.eye(phi.numel()))
         self.q = q = self.directions.numel()
-        self.symbols = ca.SX.sym(f"net{number}", 1 + q, out)  # a column for each output: value, slopes
-        self.y, self.slopes = self.symbols[0, :].T, self.symbols[1:, :].T @ ca.jacobian(self.directions, z)
+        self.symbols: ca.SX = ca.SX.sym(f"net{number}", 1 + q, out)  # a column for each output: value, slopes
+        along = ca.jacobian(self.directions, z)
+        self.y: ca.SX = self.symbols[0, :].T
+        self.slopes: ca.SX = self.symbols[1:, :].T @ along
         H, s = ca.SX.sym(f"H{number}", q * (q + 1) // 2), ca.SX.sym(f"s{number}", phi.numel())
         self.bend = ca.vertcat(H, s)
-        along = ca.jacobian(self.directions, z)
         through = ca.hessian(ca.dot(s, phi), z)[0]
         self.hessian = along.T @ _symmetric(q, ca.vertsplit(H)) @ along + through  # of v'y in z, v fixed
         self.tape = (q + 2) * sum(mlp.sizes[1:-1])
@@ -78,7 +84,7 @@ class _Net:
 def _symmetric(q: int, upper: Columns) -> ca.SX:
     """A matrix from its upper triangle, row by row."""
     H = ca.SX(q, q)
-    for (i, j), entry in zip(((i, j) for i in range(q) for j in range(i, q)), upper, strict=True):
+    for (i, j), entry in zip(combinations_with_replacement(range(q), 2), upper, strict=True):
         H[i, j] = H[j, i] = entry
     return H
 
@@ -107,13 +113,54 @@ class _Stage:
         self.v, self.W = ca.densify(self.v), ca.tril(H)
 
 
-def _chain(n: int, m: int, J_pattern: ca.Sparsity, W_pattern: ca.Sparsity) -> list[str]:
+def _chain(n: int, m: int, J: ca.Sparsity, W: ca.Sparsity) -> str:
+    """stage_adjoints() and step_derivatives(): straight-line code while that is small, else loops over sparse rows."""
+    S = _closure(n, m, J)
+    JS, WS = (_dense(p).astype(int) @ S.astype(int) for p in (J, ca.Sparsity.unite(W, W.T)))
+    terms = 3 * int(JS.sum() + WS.sum() + S.sum(axis=1) @ (WS > 0).sum(axis=1) / 2)  # the first stage has S = 1
+    return "\n".join(_straight_chain(n, m, J, W)) if terms <= STRAIGHT else _looped_chain(n, m, J, W, S)
+
+
+def _closure(n: int, m: int, J: ca.Sparsity) -> NDArray[np.bool_]:
+    """The pattern of d(x at a stage, u)/d(x, u), closed under multiplication by J."""
+    A = np.zeros((n + m, n + m), dtype=bool)
+    A[:n] = _dense(J)[:n]
+    S = A | np.eye(n + m, dtype=bool)
+    while True:
+        wider = S | (A.astype(int) @ S.astype(int) > 0)
+        if (wider == S).all():
+            return S
+        S = wider
+
+
+def _dense(pattern: ca.Sparsity) -> NDArray[np.bool_]:
+    dense: NDArray[np.bool_] = ca.DM(pattern, 1.0).full() != 0
+    return dense
+
+
+def _looped_chain(n: int, m: int, J: ca.Sparsity, W: ca.Sparsity, S: NDArray[np.bool_]) -> str:
+    """The tables that csrc/chain.h reads, and itself."""
+    number = np.full(W.shape, -1)
+    rows, columns = W.get_triplet()
+    number[rows, columns] = number[columns, rows] = np.arange(W.nnz())
+    whole = number >= 0
+    T = whole.astype(int) @ S.astype(int) > 0
+    lines = [_table(f"{name}_{part}", values) for name, pattern in (("J", _dense(J)), ("W", whole), ("S", S), ("T", T))
+             for part, values in (("ROW", np.r_[0, np.cumsum(pattern.sum(axis=1))]), ("COL", np.nonzero(pattern)[1]))]
+    return "\n".join([*lines, _table("W_AT", number[whole]), f"#define S_ROW_END {S.sum()}", '#include "chain.h"', ""])
+
+
+def _table(name: str, values: NDArray[np.int64]) -> str:
+    return f"static const int {name}[] = {{{', '.join(map(str, values.tolist() or [0]))}}};"
+
+
+def _straight_chain(n: int, m: int, J_pattern: ca.Sparsity, W_pattern: ca.Sparsity) -> list[str]:
     """The chain rule through one RK4 step, with the stages' Jacobians and Hessians as symbols (see csrc/ddp.h)."""
     nz, nj, nw = n + m, J_pattern.nnz(), W_pattern.nnz()
     reach, share = (0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)
     h, lam = ca.SX.sym("h"), ca.SX.sym("lam", n)
     Js, Ws = ca.SX.sym("J", 4 * nj), ca.SX.sym("W", 4 * nw)
-    J = [ca.SX(J_pattern, Js[i * nj:(i + 1) * nj]) for i in range(4)]
+    J = [ca.SX(J_pattern.T, Js[i * nj:(i + 1) * nj]).T for i in range(4)]
     W = [ca.tril2symm(ca.SX(W_pattern, Ws[i * nw:(i + 1) * nw])) for i in range(4)]
     mu = [ca.SX()] * 4
     for i in reversed(range(4)):

@@ -182,4 +182,22 @@ def test_sines_are_accurate_wherever_they_are_asked():
     got = run(Kernel(source([ca.sin(A), ca.cos(A)])), np.stack([x, x], axis=1), 2)
     np.testing.assert_allclose(got, np.stack([np.sin(x), np.cos(x)], axis=1), rtol=1e-15, atol=0)
     bad = np.array([[np.nan] * 2, [np.inf] * 2, [1.0] * 2, [-np.inf] * 2])
-    assert np.isnan(run(Kernel(source([ca.sin(A), ca.cos(A)])), bad, 2)).all(axis=1).tolist() == [True, True, False, True]
+    both = np.isnan(run(Kernel(source([ca.sin(A), ca.cos(A)])), bad, 2))
+    assert both.all(axis=1).tolist() == [True, True, False, True]
+
+
+@pytest.mark.parametrize("name", ["cartpole", "quadrotor"])
+def test_looped_chain_rule_equals_the_straight_one(name, tmp_path, monkeypatch):
+    import nocl
+    from nocl.solvers import ddp_kernel
+    from nocl.solvers.ddp import DDP
+
+    ocp = nocl.load_ocp(name)
+    x0, answers = ocp.initial_states.sample(3, 0), []
+    for limit in (10**9, 0):
+        monkeypatch.setattr(ddp_kernel, "STRAIGHT", limit)
+        assert ("chain.h" in ddp_kernel.ddp_source(ocp)) == (limit == 0)
+        answers.append(DDP(ocp, intervals=20, threads=1, cache=tmp_path).solve(x0, curvature=True))
+    for field in ("cost", "u", "gain", "V_x", "V_xx"):
+        a, b = (getattr(s, field) for s in answers)
+        np.testing.assert_allclose(a, b, rtol=1e-7, atol=1e-9 * np.abs(b).max(), err_msg=field)

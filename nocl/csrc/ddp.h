@@ -7,17 +7,14 @@
    network_weights(x, u, net, mu, v)          v[NV] = d(mu'(xdot, L))/d(values)
    network_bend(weights, v, tape, bend)       bend[BEND]
    field(x, u, net, out)                      out[N+1]: xdot, L; reads only the networks' values
-   stage_jacobian(x, u, net, J)               nonzeros of d(xdot, L)/d(x, u)
+   stage_jacobian(x, u, net, J)               nonzeros of d(xdot, L)/d(x, u), row by row
    stage_hessian(x, u, net, bend, mu, W)      nonzeros of the Hessian of mu'(xdot, L)
    stage_adjoints(J2, J3, J4, lam, h, mu)     mu[4 (N+1)], what weights the four stages of a Runge-Kutta step
    step_derivatives(J, W, h, F, l, H)         F[N NZ] = dx+/dz, l[NZ] = dcost/dz, H[NZ NZ] the Hessian of lam'x+ + cost
+                                              (only its lower triangle is read); these two may stand in chain.h
    terminal(x, G, Gx, Gxx)
 
    Arrays are problem-major, rows as numpy has them: x [B, K+1, N], u [B, K, M], gains [B, K, M, N]. */
-#define NZ (N + M)
-
-static const double reach[4] = {0, 0.5, 0.5, 1}, share[4] = {1. / 6, 1. / 3, 1. / 3, 1. / 6};
-
 /* One Runge-Kutta step, x to next; returns its cost. */
 static lane step(const double *weights, const lane *x, const lane *u, lane h, lane *next)
 {
