@@ -17,7 +17,6 @@ from nocl.comparisons.report import REFERENCE, Report, count, percent
 from nocl.comparisons.tables import Table, facts, tables, x0_text
 
 SAID_FIRST = 3  # sentences of the verdict that stand above the table
-PICTURES = 250_000  # bytes of an SVG above which the printed page has the PNG
 
 
 def page(report: Report, pictures: Mapping[str, Mapping[str, bytes]], run: Mapping[str, Any]) -> str:
@@ -111,9 +110,8 @@ def _static(pictures: Mapping[str, Mapping[str, bytes]], name: str) -> str:
     """The picture that stands in for a plot on paper."""
     if name not in pictures:
         return ""
-    svg = pictures[name]["svg"]
-    form, content = ("svg+xml", svg) if len(svg) <= PICTURES else ("png", pictures[name]["png"])
-    source = f"data:image/{form};base64,{base64.b64encode(content).decode()}"
+    form, content = min(pictures[name].items(), key=lambda item: len(item[1]))
+    source = f"data:image/{'svg+xml' if form == 'svg' else form};base64,{base64.b64encode(content).decode()}"
     return f'<img class=static alt="{escape(name)}" src="{source}">'
 
 

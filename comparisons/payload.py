@@ -1,6 +1,6 @@
 """What the page draws from: a Report as compact plain data, arrays in base64. B is the batch, M the methods.
 
-Runs are the bulk. Each (state, channel) of a method is kept on NODES times as 16-bit steps between its least and its
+Runs are the bulk. Each (state, channel) of a method is kept at some times as 16-bit steps between its least and its
 greatest value, an error of at most 1 / 131068 of that range: far below a pixel. The page decodes them at a click.
 """
 
@@ -20,8 +20,7 @@ from nocl.comparisons.explain import explained_method
 from nocl.comparisons.report import Judged, Report
 from nocl.ocp import OCP
 
-NODES = (81, 41, 21)  # times of a run, the most that BUDGET allows
-BUDGET = 3_500_000  # characters that runs may take
+NODES = {81: 1_500_000, 41: 2_500_000, 21: 3_700_000}  # times of a run, and the characters that all runs may take then
 MISSING = 65535  # the 16-bit step that stands for NaN
 PAIRS = 6  # of coordinates that V is drawn over
 TIMES = (0.0, 0.5, 0.9)  # of the horizon that V is drawn at
@@ -52,16 +51,16 @@ def floats(values: ArrayLike) -> str:
 
 
 def kept_states(report: Report) -> tuple[int, NDArray[np.integer[Any]]]:
-    """(nodes, states) whose runs fit into BUDGET: all states if they can, else the worst and an even choice."""
+    """(nodes, states) whose runs fit into the page: all states if they can, else the worst and an even choice."""
     channels = _channels(report)
     size = len(report.judged) * channels * 2 * 4 / 3  # characters of one state at one node
-    for nodes in NODES:
-        if len(report.x0) * (nodes + 4) * size <= BUDGET:
+    for nodes, budget in NODES.items():
+        if len(report.x0) * (nodes + 4) * size <= budget:
             return nodes, np.arange(len(report.x0))
-    n = max(1, int(BUDGET / ((NODES[-1] + 4) * size)))
+    n = max(1, int(budget / ((nodes + 4) * size)))
     order = np.argsort(-report.gap[explained_method(report)], kind="stable")
     even = np.linspace(0, len(order) - 1, n - n // 4).astype(int)
-    return NODES[-1], np.unique(np.r_[order[: n // 4], order[even]])
+    return nodes, np.unique(np.r_[order[: n // 4], order[even]])
 
 
 def _channels(report: Report) -> int:
