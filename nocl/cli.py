@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 if TYPE_CHECKING:
     from nocl.ocp import OCP
 
-METHODS = ("CND", "NMPC", "NMPC-LOOP", "LQR", "DDP")
+METHODS = ("CND", "NMPC", "LQR", "DDP", "NMPC-LOOP")
 SOLVERS = ("nmpc", "ddp", "lqr")
 FORMS = ("casadi", "l4casadi", "onnx", "c")
 QUICK_PROOF = ("casadi", "onnx", "c")  # of a run: L4CasADi takes half a minute to build
@@ -87,6 +87,8 @@ def parser() -> argparse.ArgumentParser:
     sub = command("solve", _solve, "solve the problem from many initial states")
     _add(sub, "problem", "out", "seed", "n", "intervals")
     sub.add_argument("--solver", choices=SOLVERS, default="nmpc", help="default: nmpc")
+    sub.add_argument("--workers", type=_workers, default="auto", metavar="W",
+                     help="of NMPC's processes or DDP's threads, auto, or a Dask scheduler's tcp://...; default: auto")
     sub = command("export", _export, "write a run's controller, value function and dynamics, proven equal to it")
     _add(sub, "run")
     sub.add_argument("--to", choices=FORMS, action="append", help="default: casadi and c; may be given several times")
@@ -152,6 +154,10 @@ def _version() -> str:
 
 def _count(text: str) -> int:
     return _whole(text, 1, MOST)
+
+
+def _workers(text: str) -> int | str:
+    return text if text == "auto" or "://" in text else _count(text)
 
 
 def _seed(text: str) -> int:
@@ -303,7 +309,7 @@ def _solve(args: argparse.Namespace) -> None:
     from nocl.stages import solve
 
     ocp, out = _problem(args)
-    solve(ocp, out / "solutions", args.solver, args.n, args.seed, args.intervals)
+    solve(ocp, out / "solutions", args.solver, args.n, args.seed, args.intervals, args.workers)
 
 
 def _export(args: argparse.Namespace) -> None:

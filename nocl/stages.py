@@ -208,6 +208,7 @@ def load_run(folder: Path) -> CND:
 def method(ocp: OCP, name: str, intervals: int) -> Any:
     """A method of the comparison other than CND, by name."""
     from nocl import solvers
+    from nocl.solvers.global_search import GlobalDDP
 
     match name.upper():
         case "NMPC":
@@ -215,33 +216,55 @@ def method(ocp: OCP, name: str, intervals: int) -> Any:
         case "NMPC-LOOP":
             return solvers.NMPC(ocp, intervals=intervals).controller()
         case "DDP":
-            return solvers.DDP(ocp, intervals=intervals)
+            return GlobalDDP(solvers.DDP(ocp, intervals=intervals))
         case "LQR":
             return solvers.LQR(ocp)
     raise ValueError(f"method is {name!r}; expected NMPC, NMPC-LOOP, DDP or LQR")
 
 
-def solve(ocp: OCP, out: Path, name: str, n: int, seed: int, intervals: int) -> None:
-    """Solve n initial states by one solver, and write OUT/NAME.npz (arrays), .json (messages) and a line of summary."""
+def solve(ocp: OCP, out: Path, name: str, n: int, seed: int, intervals: int, workers: int | str = "auto") -> None:
+    """Solve n initial states by one solver, and write OUT/NAME.npz (arrays), .json (messages) and a line of summary.
+
+    What is solved is kept in OUT/checkpoint until all is: the same call goes on from there.
+    """
     from nocl.simulate import simulate
 
     solver, x0 = method(ocp, name, intervals), fresh_states(ocp, n, seed)
-    start = time.perf_counter()
+    start, checkpoint = time.perf_counter(), out / "checkpoint" / _solve_key(ocp, name, n, seed, intervals)
+    facts: dict[str, Any] = {"solver": name, "n": n, "seed": fresh_seed(seed)}
     if name == "lqr":
         s = simulate(ocp, solver, x0)
         arrays = {"t": s.t, "x": s.x, "u": s.u, "cost": s.cost, "success": s.success}
-        message = s.message
     else:
-        solution = solver.solve(x0)
-        arrays = {"t": solution.t, "x": solution.x, "u": solution.u, "cost": solution.cost, "success": solution.success,
-                  "costate": solution.costate if hasattr(solution, "costate") else solution.V_x}
-        message = solution.message
+        s, arrays, more = _solved(solver, x0, seed, workers, checkpoint)
+        facts |= more
     path = _write_arrays(out / f"{name}.npz", {"x0": x0, **arrays})
-    store.write_json(out / f"{name}.json", {"solver": name, "n": n, "seed": fresh_seed(seed), "message": list(message)})
+    store.write_json(out / f"{name}.json", {**facts, "message": list(s.message)})
+    _forget(checkpoint)
     ok = arrays["success"]
     mean = f", mean cost {arrays['cost'][ok].mean():.4g}" if ok.any() else ""
     did = "simulated" if name == "lqr" else "solved"
     say(f"{name}: {ok.sum()} of {n} {did}{mean}, {time.perf_counter() - start:.1f} s\n{path}")
+
+
+def _solved(solver: Any, x0: np.ndarray[Any, np.dtype[np.float64]], seed: int, workers: int | str,
+            checkpoint: Path) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+    """(solution, its arrays, how sure each optimum is) of NMPC, or of DDP from everywhere."""
+    from nocl.solvers.global_search import GlobalDDP, solve_globally
+
+    if isinstance(solver, GlobalDDP):
+        found = solve_globally(solver.ddp, x0, starts=solver.starts, seed=seed, workers=workers, out=checkpoint)
+        s, costate = found.best, found.best.V_x
+    else:
+        s = found = solver.solve(x0, workers=workers, out=checkpoint)
+        costate = s.costate
+    arrays = {"t": s.t, "x": s.x, "u": s.u, "cost": s.cost, "success": s.success, "costate": costate}
+    return s, arrays, {"starts": found.starts, "hits": found.hits, "optima": [len(o) for o in found.optima]}
+
+
+def _solve_key(ocp: OCP, *settings: Any) -> str:
+    text = json.dumps([ocp.to_data(), *settings, __version__, version("casadi")], sort_keys=True)
+    return f"{settings[0]}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
 
 
 def _write_arrays(path: Path, arrays: dict[str, Any]) -> Path:

@@ -204,7 +204,41 @@ def test_solve_writes_solutions(here, capsys, solver):
         assert data["success"].all()
         assert data["cost"].shape == (2,)
         assert np.isfinite(data["x"]).all()
-    assert json.loads((here / "new" / "solutions" / f"{solver}.json").read_text())["n"] == 2
+    facts = json.loads((here / "new" / "solutions" / f"{solver}.json").read_text())
+    assert facts["n"] == 2
+    assert solver == "lqr" or all(hits <= starts for hits, starts in zip(facts["hits"], facts["starts"], strict=True))
+
+
+def test_an_interrupted_solve_goes_on(here, monkeypatch):
+    """DDP's stages and NMPC's states so far are kept until all is solved."""
+    from nocl.solvers.ddp import DDP
+
+    command = ["solve", "cubic.py", "--solver", "ddp", "--n", "4", "--intervals", "9", "--workers", "1", "--out", "new"]
+    done, left, descend = [], [5], DDP.descend
+
+    def counted(self, batch):
+        if left == [len(done)]:
+            left.clear()
+            raise KeyboardInterrupt
+        done.append(len(batch.x0))
+        return descend(self, batch)
+
+    monkeypatch.setattr(DDP, "descend", counted)
+    assert main(command) == 130
+    assert any((here / "new" / "solutions" / "checkpoint").iterdir())
+    assert main(command) == 0
+    resumed, done[:] = sum(done), []
+    assert main([*command[:-1], "again"]) == 0
+    assert resumed == sum(done)  # nothing was solved twice
+    assert not (here / "new" / "solutions" / "checkpoint").exists()
+    with np.load(here / "new" / "solutions" / "ddp.npz") as a, np.load(here / "again" / "solutions" / "ddp.npz") as b:
+        np.testing.assert_array_equal(a["u"], b["u"])
+
+
+@pytest.mark.parametrize("workers", ["0", "two", "-1"])
+def test_bad_workers_are_refused(here, capsys, workers):
+    assert main(["solve", "cubic.py", "--workers", workers]) == 2
+    assert "workers" in capsys.readouterr().err
 
 
 SMALL = TrainSettings(seeds=3, starts=2, states=6, tails=30, visits=20, rounds=0, iterations=40, value_tails=30,
