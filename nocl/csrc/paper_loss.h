@@ -57,6 +57,33 @@ INLINE real sum_of(vec x)
     return sum;
 }
 
+#if BYTES == 64 && SINGLE
+#define EVEN {0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30}
+#elif BYTES == 64 || (BYTES == 32 && SINGLE)
+#define EVEN {0, 2, 4, 6, 8, 10, 12, 14}
+#elif BYTES == 32 || SINGLE
+#define EVEN {0, 2, 4, 6}
+#else
+#define EVEN {0, 2}
+#endif
+#if SINGLE
+typedef int32_t lanes __attribute__((vector_size(BYTES)));
+#else
+typedef int64_t lanes __attribute__((vector_size(BYTES)));
+#endif
+
+/* The sums over lanes of 16 vectors, at once: neighbouring lanes of pairs of vectors are added until one is left. */
+INLINE void sums_of(vec x[16], real total[16])
+{
+    const lanes even = EVEN, odd = even + 1;
+#pragma GCC unroll 4
+    for (int n = 8; n >= 16 / LANES; n /= 2)
+#pragma GCC unroll 8
+        for (int i = 0; i < n; ++i)
+            x[i] = __builtin_shuffle(x[2 * i], x[2 * i + 1], even) + __builtin_shuffle(x[2 * i], x[2 * i + 1], odd);
+    memcpy(total, x, 16 * sizeof(real));
+}
+
 #ifdef WITH_MVEC
 #define EACH(name) extern vec MVEC(name)(vec); static inline vec v_##name(vec x) { return MVEC(name)(x); }
 #else
@@ -110,33 +137,38 @@ INLINE void product_columns(int columns, int M, int K, const real *A, int sm, in
 {
     int m = 0;
     for (; m + 4 <= M; m += 4) product_block(4, columns, K, A + m * sm, sm, sk, ld, in, out + m * ld);
-    for (; m < M; ++m) product_block(1, columns, K, A + m * sm, sm, sk, ld, in, out + m * ld);
+    for (; M % 4 && m < M; ++m) product_block(1, columns, K, A + m * sm, sm, sk, ld, in, out + m * ld);
 }
 
 INLINE void product(int M, int K, const real *A, int sm, int sk, int n, int ld, const vec *in, vec *out)
 {
     int c = 0;
     for (; c + 4 <= n; c += 4) product_columns(4, M, K, A, sm, sk, ld, in + c, out + c);
-    for (; c < n; ++c) product_columns(1, M, K, A, sm, sk, ld, in + c, out + c);
+    for (; n % 4 && c < n; ++c) product_columns(1, M, K, A, sm, sk, ld, in + c, out + c);
 }
 
 /* gradient[m, k] += the sum over lanes and columns of left[m][c] right[k][c]; gradient [M, K] by rows. */
 INLINE void outer_block(int rows, int columns, int K, int n, int ld, const vec *left, const vec *right, real *gradient)
 {
-    vec sum[4][4];
-#pragma GCC unroll 4
-    for (int m = 0; m < rows; ++m)
-#pragma GCC unroll 4
-        for (int k = 0; k < columns; ++k) sum[m][k] = (vec){0};
+    vec sum[16];
+    real total[16];
+#pragma GCC unroll 16
+    for (int i = 0; i < 16; ++i) sum[i] = (vec){0};
     for (int c = 0; c < n; ++c)
 #pragma GCC unroll 4
         for (int m = 0; m < rows; ++m)
 #pragma GCC unroll 4
-            for (int k = 0; k < columns; ++k) sum[m][k] += left[m * ld + c] * right[k * ld + c];
+            for (int k = 0; k < columns; ++k) sum[4 * m + k] += left[m * ld + c] * right[k * ld + c];
+    if (rows * columns < 4) {
+        for (int m = 0; m < rows; ++m)
+            for (int k = 0; k < columns; ++k) gradient[m * K + k] += sum_of(sum[4 * m + k]);
+        return;
+    }
+    sums_of(sum, total);
 #pragma GCC unroll 4
     for (int m = 0; m < rows; ++m)
 #pragma GCC unroll 4
-        for (int k = 0; k < columns; ++k) gradient[m * K + k] += sum_of(sum[m][k]);
+        for (int k = 0; k < columns; ++k) gradient[m * K + k] += total[4 * m + k];
 }
 
 INLINE void outer_rows(int rows, int K, int n, int ld, const vec *left, const vec *right, real *gradient)
@@ -160,7 +192,6 @@ typedef struct {
     vec z[NZ * T], f[NX * T], dfdz[NZ * LD];  /* labels; dfdz[i][o T + t] */
     vec a1[H * T], d1[H * T], e1[H * T], a2[H * T], d2[H * T], e2[H * T], y[NX * T];
     vec G2[H * LD], P[H * LD], G1[H * LD], J[NZ * LD];  /* dy/dt2, dy/da1, dy/dt1, dy/dz */
-    vec G1_bar[H * LD], G2_bar[H * LD];
     vec t1_bar[H * T], t2_bar[H * T], d1_bar[H * T], d2_bar[H * T];
 } tile;
 
@@ -176,6 +207,18 @@ static void load(tile *s, const int64_t *at, int64_t n, const real *z, const rea
                 for (int o = 0; o < NX; ++o)
                     for (int i = 0; i < NZ; ++i) s->dfdz[i * LD + o * T + t][lane] = dfdz[(row * NX + o) * NZ + i];
         }
+}
+
+/* Asks for the labels of the tile to come: random rows of large arrays are not in any cache. */
+static void prefetch(const int64_t *at, int64_t n, const real *z, const real *f, const real *dfdz)
+{
+    for (int64_t own = 0; own < n && own < T * LANES; ++own) {
+        const int64_t row = at[own];
+        __builtin_prefetch(z + row * NZ);
+        __builtin_prefetch(f + row * NX);
+        for (size_t byte = 0; dfdz && byte < NX * NZ * sizeof(real); byte += 64)
+            __builtin_prefetch((const char *)(dfdz + row * NX * NZ) + byte);
+    }
 }
 
 INLINE void add_bias(int M, const real *b, vec *x)
@@ -232,29 +275,31 @@ INLINE real units(int rows, int ld, vec *x, const vec *label, const real *scale,
     return total;
 }
 
-/* The Jacobian's part of the gradient, from J (now its adjoint): into g, and into d1_bar, d2_bar for the values' part. */
+/* The Jacobian's part of the gradient, from J (now its adjoint): into g, and d1_bar, d2_bar for the values' part.
+   The adjoints of dy/dt1 and dy/dt2 take the places of G1 and P, which are not needed by then. */
 static void jacobian_backward(tile *s, const real *w, real *g)
 {
+    vec *G1_bar = s->G1, *G2_bar = s->P;
     outer(H, NZ, C, LD, s->G1, s->J, g);
-    product(H, NZ, w, NZ, 1, C, LD, s->J, s->G1_bar);
+    product(H, NZ, w, NZ, 1, C, LD, s->J, G1_bar);
     for (int k = 0; k < H; ++k)
         for (int t = 0; t < T; ++t) {
             vec sum = (vec){0};
             for (int o = 0; o < NX; ++o) {
                 const int c = k * LD + o * T + t;
-                sum += s->G1_bar[c] * s->P[c];
-                s->G1_bar[c] *= s->d1[k * T + t];  /* now the adjoint of P */
+                sum += G1_bar[c] * s->P[c];
+                G1_bar[c] *= s->d1[k * T + t];  /* now the adjoint of P */
             }
             s->d1_bar[k * T + t] = sum;
         }
-    outer(H, H, C, LD, s->G2, s->G1_bar, g + W2);
-    product(H, H, w + W2, H, 1, C, LD, s->G1_bar, s->G2_bar);
+    outer(H, H, C, LD, s->G2, G1_bar, g + W2);
+    product(H, H, w + W2, H, 1, C, LD, G1_bar, G2_bar);
     for (int j = 0; j < H; ++j) {
         for (int t = 0; t < T; ++t) s->d2_bar[j * T + t] = (vec){0};
         for (int o = 0; o < NX; ++o) {
             vec sum = (vec){0};
             for (int t = 0; t < T; ++t) {
-                const vec bar = s->G2_bar[j * LD + o * T + t];
+                const vec bar = G2_bar[j * LD + o * T + t];
                 s->d2_bar[j * T + t] += w[W3 + o * H + j] * bar;
                 sum += bar * s->d2[j * T + t];
             }
@@ -302,6 +347,7 @@ void nocl_loss(int64_t first_block, int64_t last_block, const int64_t *at, int64
     for (int64_t first = 0; first < n; first += T * LANES) {
         const int64_t left = n - first;
         load(s, at + first, left, z, f, dfdz);
+        prefetch(at + first + T * LANES, left - T * LANES, z, f, dfdz);
         values(s, w);
         *loss += units(1, C, s->y, s->f, scale, 1, left) / n;
         if (dfdz) {
