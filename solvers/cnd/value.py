@@ -6,7 +6,7 @@ horizon V = G is one where G is a sum of squares, and V never falls below what c
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import casadi as ca
@@ -26,6 +26,7 @@ from nocl.to_torch import to_torch
 
 SMALL = 0.1  # of the median: labels below count as if they were that large in relative errors
 ROUND = 0.01  # relative errors above it count by their size, not their square: few labels are hard, or not global
+PIECE = 2000  # problems solved on the fine grid at a time
 CHUNK = 20_000  # labels whose features are computed at a time
 
 
@@ -42,26 +43,29 @@ class ValueLabels:
         return len(self.V)
 
     @staticmethod
-    def of(solutions: Sequence[DDPSolution]) -> ValueLabels:
+    def of(solutions: Iterable[DDPSolution]) -> ValueLabels:
         """Start, end and nodes at doubling distances between them: later nodes have drawn together and tell little."""
-        solved = [s[s.success] for s in solutions]
-        K = solved[0].u.shape[1]
-        doubling = 2 ** np.arange(int(np.log2(max(K - 1, 1))) + 1)
-        nodes = np.unique(np.concatenate([[0, K], doubling[doubling < K]]))
-        return ValueLabels(*(np.concatenate([np.concatenate(getattr(s, name)[:, nodes]) for s in solved])
-                             for name in ValueLabels.__dataclass_fields__))
+        names, parts = list(ValueLabels.__dataclass_fields__), []
+        for s in solutions:
+            solved, K = s.success, s.u.shape[1]
+            doubling = 2 ** np.arange(int(np.log2(max(K - 1, 1))) + 1)
+            nodes = np.unique(np.concatenate([[0, K], doubling[doubling < K]]))
+            parts.append([np.concatenate(getattr(s, name)[solved][:, nodes]) for name in names if solved.any()])
+        return ValueLabels(*(np.concatenate(column) for column in zip(*filter(None, parts), strict=True)))
 
 
 def value_solutions(ddp: DDP, fine: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, *, tails: int,
-                    visits: int, width: float, kick: float, rng: np.random.Generator) -> list[DDPSolution]:
+                    visits: int, width: float, kick: float, rng: np.random.Generator) -> Iterator[DDPSolution]:
     """The bank's solutions, and tails from states of the tube and from those that the policy visits under kicks, on
-    the fine grid: a held control costs O(h^2) more than a continuous one."""
+    the fine grid: a held control costs O(h^2) more than a continuous one. Piece by piece: they take much memory."""
     _, t0, x = tube_states(bank, tails, width, ddp.ocp.horizon, rng)
     x_kicked, t_kicked = kicked_states(ddp.ocp, bank, policy, f, visits, kick, rng)
     found = answered(ddp, bank, policy, f, np.concatenate([x, x_kicked]), np.concatenate([t0, t_kicked]))
     times = fine.intervals // ddp.intervals
-    return [fine.solve(s.x[:, 0], s.t[:, 0], u=np.repeat(s.u, times, axis=1))
-            for s in (bank.solution, found[found.success])]
+    for all_of in (bank.solution, found[found.success]):
+        for start in range(0, len(all_of), PIECE):
+            s = all_of[start:start + PIECE]
+            yield fine.solve(s.x[:, 0], s.t[:, 0], u=np.repeat(s.u, times, axis=1))
 
 
 def value_net(ocp: OCP, labels: ValueLabels, sizes: tuple[int, ...]) -> FeatureNet:
