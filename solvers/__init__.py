@@ -5,7 +5,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import Any
 
-_LAZY = {"LQR": "nocl.solvers.lqr", "NMPC": "nocl.solvers.nmpc", "DDP": "nocl.solvers.ddp", "CND": "nocl.solvers.cnd"}
+_LAZY = {"LQR": "nocl.solvers.lqr", "NMPC": "nocl.solvers.nmpc", "DDP": "nocl.solvers.ddp", "CND": "nocl.solvers.cnd",
+         "SolutionBank": "nocl.solvers.bank", "solve_globally": "nocl.solvers.global_search"}
 __all__ = list(_LAZY)
 
 

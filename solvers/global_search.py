@@ -1,6 +1,6 @@
 """Global optima by the batch: cold starts of several kinds, then each state from its neighbours' solutions.
 
-What is tried, in the order of what it found on cart-poles from anywhere (`docs/experiments.md`):
+What is tried, in the order of what it found on cart-poles from anywhere (docs/ddp.md):
 
 - smooth random controls under the feedback that holds an equilibrium, from a random time on: a pole that can be
   caught is, which no open-loop control of an unstable system stumbles on;
