@@ -34,7 +34,6 @@ from nocl.systems import NAMES
 
 FINE = 320  # intervals of the optimum, a multiple of SLOTS
 STARTS = 8  # cold starts of the undisturbed optimum for each state
-FASTEST = 200  # rate in samples over the horizon that a loop which can be faster is run at
 INSTANT = 1000  # a feedback law that could answer so often over the horizon is run continuously
 
 
@@ -48,10 +47,11 @@ class Disturbances:
     hold: int = 80  # intervals that all feedback is held on under noise, held and late
     late: float = 0.5  # delay, as a share of such an interval
     weaker: float = 0.2  # share that controls lack where the model is wrong
+    fastest: int = 200  # samples over the horizon that a loop which could be faster is run at in real time
     seed: int = 12345
 
     def __post_init__(self) -> None:
-        for name in ("kicks", "hold"):
+        for name in ("kicks", "hold", "fastest"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
                 raise ValueError(f"Disturbances: {name} is {value!r}; expected an integer >= 1")
@@ -149,7 +149,7 @@ class _Study:
 
     def real_time(self, calm: Sequence[Judgement], best: Array) -> Scenario:
         """Each loop at the rate that its measured time allows, that late; laws that answer at once continuously."""
-        T, runs, delays = self.ocp.horizon, list[Run](), list[float]()
+        T, most, runs, delays = self.ocp.horizon, self.settings.fastest, list[Run](), list[float]()
         for run, judgement in zip(self.runs, calm, strict=True):
             ms = judgement.ms_per_control[np.isfinite(judgement.ms_per_control)]
             seconds = float(np.quantile(ms, 0.95)) / 1e3 if ms.size else 0.0
@@ -157,11 +157,11 @@ class _Study:
                 runs.append(run)
                 delays.append(0.0)
                 continue
-            K = int(np.clip(T / max(seconds, T / FASTEST), 1, FASTEST))
+            K = int(np.clip(T / max(seconds, T / most), 1, most))
             delays.append(min(seconds, T / K))
             runs.append(replace(run, hold=K, how=how(K, delays[-1]), controller=at_rate(run.controller, K)))
         text = ("Each controller at the rate that it can afford: its measured time (95 % of the states take no longer) "
-                f"is its delay, and it is asked again when it has answered, {FASTEST} times at most.")
+                f"is its delay, and it is asked again when it has answered, {most} times at most.")
         return self.play("real time", text, runs, best, delays=delays)
 
     def play(self, name: str, text: str, runs: Sequence[Run], best: Array, delays: Sequence[float] | None = None,
