@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import base64
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
 from nocl.checks import Array
@@ -45,8 +47,6 @@ def gap_map(report: Report) -> Figure | None:
 
 def value_slices(report: Report) -> Figure | None:
     """V over its first pair of coordinates at three times, with runs on top."""
-    import base64
-
     data = slices(report)
     if data is None:
         return None
@@ -57,9 +57,14 @@ def value_slices(report: Report) -> Figure | None:
     figure = Figure(figsize=(3.1 * len(data["t"]) + 0.6, 3.1), layout="constrained")
     axes = figure.subplots(1, len(data["t"]), sharey=True, squeeze=False)[0]
     for ax, t, z in zip(axes, data["t"], V[0], strict=True):
-        drawn = ax.contourf(np.linspace(low[i], high[i], n), np.linspace(low[k], high[k], n), z, levels=20,
-                            cmap="Blues_r")
-        figure.colorbar(drawn, ax=ax)
+        most = max(float(np.nanmax(z)), 1e-12)
+        floor = max(1e-4 * most, float(np.nanmin(z)))  # colours go by powers of ten
+        drawn = ax.contourf(np.linspace(low[i], high[i], n), np.linspace(low[k], high[k], n), np.maximum(z, floor),
+                            levels=np.geomspace(min(floor, 0.999 * most), most, 20), norm=LogNorm(), cmap="Blues")
+        bar = figure.colorbar(drawn, ax=ax)
+        ticks = np.geomspace(min(floor, 0.999 * most), most, 4)
+        bar.set_ticks(list(ticks), labels=[f"{tick:.2g}" for tick in ticks], minor=False)
+        bar.ax.minorticks_off()
         for m, j in enumerate(report.judged):
             for run in j.simulation.x[:: max(1, len(report.x0) // 15)]:
                 ax.plot(run[:, i], run[:, k], color=COLOURS[m % len(COLOURS)], linewidth=0.6, alpha=0.6)

@@ -73,8 +73,7 @@ function layout(extra) {
 const CONFIG = {responsive: true, displaylogo: false, displayModeBar: coarse.matches ? false : "hover",
                 modeBarButtonsToRemove: ["select2d", "lasso2d", "autoScale2d"], showLink: false};
 const draw = (id, traces, extra) => Plotly.react($(id), traces, layout(extra), CONFIG);
-const log = (title, extra) => axis(Object.assign({type: "log", title: {text: title}, exponentformat: "none",
-                                                  dtick: 1, minexponent: 9}, extra));
+const log = (title, extra) => axis(Object.assign({type: "log", title: {text: title}, exponentformat: "none"}, extra));
 const line = (m, more) => Object.assign({color: colour(m), dash: DASH[m % DASH.length], width: 2}, more);
 
 // ---- gap against initial state, and one state's runs ----------------------------------------------------------------
@@ -258,7 +257,7 @@ function drawSlice() {
     const x = [], y = [], dots = [[], []];
     const node = method.t.reduce((best, v, c) => Math.abs(v - t) < Math.abs(method.t[best] - t) ? c : best, 0);
     some.forEach((s) => { const r = run(m, s); x.push(...r[i], null); y.push(...r[k], null); dots[0].push(r[i][node]); dots[1].push(r[k][node]); });
-    traces.push({type: "scatter", mode: "lines", x, y, name: MNAMES[m], legendgroup: String(m), line: {color: colour(m), width: 1.2}, opacity: 0.8, hoverinfo: "skip"});
+    traces.push({type: "scatter", mode: "lines", x, y, name: MNAMES[m], legendgroup: String(m), line: line(m, {width: 1.3}), opacity: 0.85, hoverinfo: "skip"});
     traces.push({type: "scatter", mode: "markers", x: dots[0], y: dots[1], name: MNAMES[m], legendgroup: String(m), showlegend: false, hoverinfo: "skip",
                  marker: {color: colour(m), size: 5, line: {width: 0.5, color: css("--back")}}});
   });
