@@ -126,6 +126,15 @@ def _add_tables(sub: argparse.ArgumentParser) -> None:
                      help="of Adam in the paper's own ways; default: 50000, with --quick 1000")
     one.add_argument("--systems", type=_words, metavar="A,B", help="default: all four")
     one.add_argument("--ways", type=_words, metavar="A,B", help="rows, like sine-gradients,nocl; default: all nine")
+    one = table("dubins", _reproduce_dubins, "a car round an obstacle: RRT*, NMPC, level sets, CND, the optimum")
+    one.add_argument("--seeds", type=_count, default=1, metavar="K", help="sets of initial states; default: 1")
+    one.add_argument("--n", type=_count, help="initial states; default: 1000, with --quick 20")
+    one.add_argument("--iterations", type=_count, metavar="N",
+                     help="of Adam in the paper's method; default: 1000, with --quick 20")
+    one.add_argument("--grid", type=_grid, metavar="A,B,C", help="nodes of the level sets; default: 46,73,81")
+    one.add_argument("--ways", type=_words, metavar="A,B", help="rows, like rrt-100,cnd; default: all eight")
+    one = table("approaches", _reproduce_approaches, "which approach gives what: time and memory by number of states")
+    one.add_argument("--problems", type=_words, metavar="A,B", help="default: six, of 2 to 12 states")
 
 
 def _add(sub: argparse.ArgumentParser, *names: str) -> None:
@@ -179,6 +188,13 @@ def _folder(text: str) -> Path:
     return Path(text)
 
 
+def _grid(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r}; expected numbers of nodes, like 46,73,81") from None
+
+
 def _words(text: str) -> tuple[str, ...]:
     return tuple(word.strip() for word in text.split(","))
 
@@ -216,6 +232,33 @@ def _reproduce_sysid(args: argparse.Namespace) -> None:
     cells = sysid.finished(args.out)
     paths = sysid_tables.write(args.out, cells)
     print(sysid_tables.markdown(sysid.table(cells)), end="")
+    print("written:", ", ".join(map(str, paths)))
+
+
+def _reproduce_dubins(args: argparse.Namespace) -> None:
+    from dataclasses import replace
+
+    from nocl.comparisons.reproduce import dubins, dubins_tables
+
+    given = {"n": args.n, "seeds": args.seeds, "paper_iterations": args.iterations, "grid": args.grid,
+             "ways": args.ways}
+    plan = replace(dubins.PLANS[args.quick], **{name: value for name, value in given.items() if value is not None})
+    _check_out(args.out)
+    dubins.run(args.out, plan)
+    cells = dubins.finished(args.out)
+    paths = dubins_tables.write(args.out, cells)
+    print(dubins_tables.markdown(dubins.table(cells)), end="")
+    print("written:", ", ".join(map(str, paths)))
+
+
+def _reproduce_approaches(args: argparse.Namespace) -> None:
+    from nocl.comparisons.reproduce import approaches
+
+    plan = approaches.Plan(nodes=15 if args.quick else 31, problems=args.problems or approaches.PROBLEMS)
+    _check_out(args.out)
+    cells = approaches.run(args.out, plan)
+    paths = approaches.write(args.out, cells)
+    print(approaches.markdown(cells), end="")
     print("written:", ", ".join(map(str, paths)))
 
 

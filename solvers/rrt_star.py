@@ -153,8 +153,8 @@ class RRTStar:
             return lambda state: bool(space.satisfiesBounds(state))
         buffer, run = cast(Any, h.buffer())  # CasADi without conversions: the check is called some 10,000 times a path
         x, values = np.zeros(3), np.zeros(h.numel_out(0))
-        buffer.set_arg(0, memoryview(x))
-        buffer.set_res(0, memoryview(values))
+        buffer.set_arg(0, memoryview(x))  # type: ignore[arg-type]
+        buffer.set_res(0, memoryview(values))  # type: ignore[arg-type]
 
         def valid(state: Any) -> bool:
             x[0], x[1], x[2] = state.getX(), state.getY(), state.getYaw()

@@ -1,0 +1,288 @@
+"""The paper's Dubins experiment: RRT* against CND round an obstacle, here with NMPC, level sets and the optimum too.
+
+A cell is one way and one seed (of the initial states, and of what is random in the way); it is kept as a file of its
+own once it is finished. All trajectories are judged on the exact f by nocl.simulate. A run succeeds where it ends
+within TOLERANCE of the goal (m and rad, angles modulo 2 pi) and holds the obstacle.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from nocl import store
+from nocl.checks import Array
+from nocl.comparisons.report import VIOLATION
+from nocl.integrate import rk4
+from nocl.ocp import OCP
+from nocl.simulate import Simulation, simulate
+from nocl.systems import load_ocp
+
+TOLERANCE = 0.1
+INTERVALS = 80
+NODES = 401  # at which continuous feedback is recorded, to measure lengths
+DRAWN = 12  # trajectories that a cell keeps for the figure
+BOX = ([-3.9, -3.6, -4.0], [0.6, 3.6, 4.0])  # of the level sets
+CELLS = "cells"
+Made = tuple[Any, float, str]  # (controller or controls, ms a state, how it was made)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to run."""
+
+    n: int = 1000
+    seeds: int = 1
+    grid: tuple[int, ...] = (46, 73, 81)
+    paper_iterations: int = 1000  # of Adam, of the paper's method
+    quick: bool = False
+    ways: tuple[str, ...] = ()  # default: all
+
+    def __post_init__(self) -> None:
+        for name in ("n", "seeds", "paper_iterations"):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise ValueError(f"reproduce dubins: {name} is {value!r}; expected an integer >= 1")
+        unknown = [way for way in self.ways if way not in WAYS]
+        if unknown:
+            raise ValueError(f"reproduce dubins: ways are {list(self.ways)}; expected some of {', '.join(WAYS)}")
+
+    def cells(self) -> list[tuple[str, int]]:
+        """(way, seed) of every cell."""
+        return [(way, seed) for seed in range(self.seeds) for way in self.ways or WAYS]
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One way on the n initial states of one seed."""
+
+    way: str
+    seed: int
+    key: dict[str, Any]  # what it was made with
+    ms: float  # a state: until its whole control trajectory is there
+    made: str  # what came before, in words
+    length: list[float]  # m
+    error: list[float]  # distance to the goal at the end, angles modulo 2 pi
+    clearance: list[float]
+    cost: list[float]  # inf where there is no trajectory
+    paths: list[list[list[float]]] = field(repr=False)  # [DRAWN, nodes, 2], of the first states
+
+    @property
+    def success(self) -> Array:
+        return (np.asarray(self.error) <= TOLERANCE) & (np.asarray(self.clearance) >= -VIOLATION)
+
+
+def run(out: str | Path, plan: Plan | None = None, *, progress: bool = True) -> list[Cell]:
+    """The cells of a plan, those that are finished in folder `out` taken from there; a way without its extra is left
+    out, and says so on the bar."""
+    folder, plan, cells = Path(out), plan or Plan(), []
+    with tqdm(plan.cells(), "Dubins", disable=not progress, unit="cell", smoothing=0.05) as bar:
+        for way, seed in bar:
+            if (missing := NEEDS.get(way)) and importlib.util.find_spec(missing) is None:
+                bar.write(f"{WAYS[way].title} is left out: {missing} is not installed")
+                continue
+            bar.set_postfix_str(f"{WAYS[way].title}, seed {seed}")
+            path = folder / CELLS / f"dubins-{way}-{seed}.json"
+            cell = _read(path) if path.is_file() else None
+            if cell is None or cell.key != _key(way, plan):
+                cell = make(way, seed, plan, folder)
+                store.write_json(path, asdict(cell))
+            cells.append(cell)
+    return cells
+
+
+def finished(out: str | Path) -> list[Cell]:
+    """All cells that the folder holds, seed by seed in the order of WAYS."""
+    cells = [_read(path) for path in sorted((Path(out) / CELLS).glob("dubins-*.json"))]
+    return sorted(cells, key=lambda c: (c.seed, list(WAYS).index(c.way)))
+
+
+def make(way: str, seed: int, plan: Plan, folder: Path) -> Cell:
+    """One cell, from nothing."""
+    ocp = load_ocp("dubins")
+    x0 = ocp.initial_states.sample(plan.n, 1 + seed)
+    controller, ms, made = WAYS[way].make(ocp, x0, seed, plan, folder)
+    s, length = judged(ocp, controller, x0)
+    turned = s.x[:, -1] - ocp.x_goal
+    turned[:, 2] = (turned[:, 2] + math.pi) % (2 * math.pi) - math.pi
+    error = np.where(s.success, np.linalg.norm(turned, axis=1), np.inf)
+    return Cell(way, seed, _key(way, plan), ms, made, length.tolist(), error.tolist(), s.clearance.tolist(),
+                s.cost.tolist(), np.round(s.x[:DRAWN, :, :2], 3).tolist())
+
+
+def judged(ocp: OCP, controller: Any, x0: Array) -> tuple[Simulation, Array]:
+    """The judge's run, and lengths in m; rows of controls that are NaN have no trajectory and the length inf."""
+    if isinstance(controller, np.ndarray):
+        bad = ~np.isfinite(controller).all(axis=(1, 2))
+        s = simulate(ocp, np.where(np.isfinite(controller), controller, 0.0), x0)
+        s.success[bad], s.cost[bad], s.x[bad] = False, np.inf, np.nan
+    else:
+        s = simulate(ocp, controller, x0, nodes=NODES) if hasattr(controller, "to_casadi") else \
+            simulate(ocp, controller, x0, hold=INTERVALS)
+    h = np.diff(s.t)
+    continuous = hasattr(controller, "to_casadi")
+    v = (s.u[:, :-1, 0] + s.u[:, 1:, 0]) / 2 if continuous else s.u[:, :-1, 0]
+    return s, np.where(s.success, v @ h, np.inf)
+
+
+def rollout_ms(ocp: OCP, controller: Callable[[Array, float], Array], x0: Array) -> float:
+    """Milliseconds a state: all states together, INTERVALS controls asked for, RK4 between them."""
+    x, h, f = x0, ocp.horizon / INTERVALS, ocp.system.f
+    controller(x, 0.0)
+    start = time.perf_counter()
+    for k in range(INTERVALS):
+        u = np.asarray(controller(x, k * h), dtype=np.float64).T
+        x = rk4(lambda z, w: f(z, w).full(), x.T, u, h).T
+    return 1e3 * (time.perf_counter() - start) / len(x0)
+
+
+def _rrt(iterations: int) -> Callable[..., Made]:
+    def made(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
+        from nocl.solvers.rrt_star import RRTStar
+
+        planner = RRTStar(ocp, iterations=iterations, seed=seed)
+        solution = planner.solve(x0)
+        u = np.where(np.asarray(solution.success)[:, None, None], solution.u, np.nan)
+        return u, float(1e3 * np.mean(solution.seconds)), f"goal within {planner.tolerance:g} m of Dubins distance"
+
+    return made
+
+
+def _nmpc(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
+    from nocl.solvers.nmpc import NMPC
+
+    solver = NMPC(ocp, INTERVALS, seed=seed)
+    solution = solver.solve(x0, progress=False)
+    u = np.where(np.asarray(solution.success)[:, None, None], solution.u, np.nan)
+    return u, float(1e3 * np.mean(solution.seconds)), f"{solver.starts} starts, then neighbours' solutions"
+
+
+def _optimum(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
+    from nocl.solvers.ddp import DDP
+    from nocl.solvers.global_search import solve_globally
+
+    ddp, start = DDP(ocp, intervals=INTERVALS), time.perf_counter()
+    best = solve_globally(ddp, x0, seed=seed).best
+    u = np.where(best.success[:, None, None], best.u, np.nan)
+    return u, 1e3 * (time.perf_counter() - start) / len(x0), "DDP, best of many starts"
+
+
+def _level_sets(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
+    from nocl.solvers.levelset import LevelSet, LevelSetSolution
+
+    problem, path = LevelSet(ocp, plan.grid, box=BOX, max_seconds=3600.0), folder / CELLS / "dubins-V.safetensors"
+    try:
+        solution = LevelSetSolution.load(path, problem)
+    except ValueError:  # none yet, or of another grid
+        solution = problem.solve()
+        solution.save(path)
+    grid = " x ".join(map(str, plan.grid))
+    return solution, rollout_ms(ocp, solution, x0), f"{grid} nodes, {solution.seconds:.0f} s"
+
+
+def _pretrained(dynamics: str) -> Callable[..., Made]:
+    def made(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
+        from nocl.solvers.cnd import pretrained
+
+        cnd = pretrained("dubins", dynamics)
+        return cnd, rollout_ms(ocp, cnd, x0), "as it ships with nocl"
+
+    return made
+
+
+def _paper(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
+    from nocl.solvers.cnd import train
+    from nocl.solvers.cnd.paper import PaperSettings
+
+    start = time.perf_counter()
+    settings = PaperSettings(iterations=plan.paper_iterations)
+    cnd = train(ocp, method="paper", seed=seed, settings=settings, progress=False)
+    text = f"{plan.paper_iterations} iterations, {time.perf_counter() - start:.0f} s"
+    return cnd, rollout_ms(ocp, cnd, x0), text
+
+
+@dataclass(frozen=True)
+class Way:
+    """A row of the table; `paper`: mean length, its s.d., seconds, success rate."""
+
+    title: str
+    make: Callable[..., Made]
+    paper: tuple[float, float, float, float] | None = None
+
+
+WAYS = {"rrt-100": Way("RRT* (iter: 100)", _rrt(100), (4.8871, 0.9607, 6.9313, 0.889)),
+        "rrt-200": Way("RRT* (iter: 200)", _rrt(200), (4.7343, 0.8451, 26.0595, 0.939)),
+        "nmpc": Way("NMPC", _nmpc), "level-sets": Way("HJB level sets", _level_sets),
+        "cnd-paper": Way("CND, the paper's method", _paper, (4.1076, 0.6916, 0.0634, 0.999)),
+        "cnd": Way("CND, nocl's default, exact f", _pretrained("exact")),
+        "cnd-learned": Way("CND, nocl's default, learned f", _pretrained("learned")),
+        "optimum": Way("multi-start optimum", _optimum)}
+NEEDS = {"rrt-100": "ompl", "rrt-200": "ompl", "level-sets": "hj_reachability"}
+PLANS = {False: Plan(), True: Plan(n=20, grid=(24, 37, 41), paper_iterations=20, quick=True)}
+
+
+def _key(way: str, plan: Plan) -> dict[str, Any]:
+    key: dict[str, Any] = {"n": plan.n}
+    if way == "level-sets":
+        key["grid"] = list(plan.grid)
+    if way == "cnd-paper":
+        key["iterations"] = plan.paper_iterations
+    return key
+
+
+def _read(path: Path) -> Cell:
+    data = store.read_json(path)
+    try:
+        numbers = {f.name: np.asarray(data[f.name], dtype=float).tolist() for f in fields(Cell)
+                   if f.name in ("length", "error", "clearance", "cost", "paths")}  # 'inf', 'nan' to numbers
+        return Cell(**{**data, **numbers})
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is no cell of the Dubins table ({error}); delete it") from error
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A row: over all states of all seeds; lengths and costs are of the runs that succeeded."""
+
+    way: str
+    length: float
+    length_std: float
+    success: float
+    ms: float
+    cost: float
+    gap: float  # per cent, median of (J - J*) / J* over states where both succeed; NaN without the optimum
+    ratio: float  # mean length over the optimum's mean length on the same states
+    n: int
+    seeds: int
+    made: str
+
+
+def table(cells: Sequence[Cell]) -> list[Entry]:
+    """One entry a way, in the order of WAYS."""
+    best = {cell.seed: cell for cell in cells if cell.way == "optimum"}
+    return [_entry([c for c in cells if c.way == way], best) for way in WAYS if any(c.way == way for c in cells)]
+
+
+def _entry(cells: Sequence[Cell], best: dict[int, Cell]) -> Entry:
+    ok = np.concatenate([c.success for c in cells])
+    length, cost = (np.concatenate([getattr(c, name) for c in cells]) for name in ("length", "cost"))
+    gap = ratio = math.nan
+    if all(c.seed in best and len(best[c.seed].cost) >= len(c.cost) for c in cells):  # same seed, same first states
+        same = [(best[c.seed], slice(len(c.cost))) for c in cells]
+        both = ok & np.concatenate([b.success[rows] for b, rows in same])
+        least, short = (np.concatenate([getattr(b, name)[rows] for b, rows in same]) for name in ("cost", "length"))
+        if both.any():
+            gap = float(100 * np.median((cost[both] - least[both]) / least[both]))
+            ratio = float(length[both].mean() / short[both].mean())
+    mean, std, J = (float(length[ok].mean()), float(length[ok].std()), float(cost[ok].mean())) if ok.any() else \
+        (math.nan, math.nan, math.nan)
+    return Entry(cells[0].way, mean, std, float(ok.mean()), float(np.mean([c.ms for c in cells])), J, gap, ratio,
+                 len(cells[0].cost), len(cells), cells[0].made)

@@ -1,0 +1,118 @@
+"""nocl reproduce dubins, approaches: cells resume, lengths and success are right, the paper's numbers stand beside."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import nocl
+from nocl.comparisons.reproduce import approaches, dubins, dubins_tables
+
+X0 = np.array([[-3.0, 1.0, 0.0], [-3.0, -1.0, 0.0]])
+
+
+def cell(way: str, length: list[float], cost: list[float], error: list[float], clearance: list[float]) -> dubins.Cell:
+    path = [[[-3.0, 1.0], [0.0, 0.0]]] * len(length)
+    return dubins.Cell(way, 0, {"n": len(length)}, 2.0, "by hand", length, error, clearance, cost, path)
+
+
+OPTIMUM = cell("optimum", [4.0, 4.0, 5.0], [0.04, 0.04, 0.05], [0.01] * 3, [0.1] * 3)
+CND = cell("cnd", [4.2, 4.4, 9.0], [0.042, 0.044, math.inf], [0.01, 0.01, math.inf], [0.1] * 3)
+
+
+def test_lengths_are_those_of_the_driven_curve():
+    """Half of the speed for 8 s: 4 m, in open loop; NaN controls are a failure, not a length."""
+    ocp = nocl.load_ocp("dubins")
+    u = np.tile([0.5, 0.2], (2, 80, 1))
+    u[1, 3] = np.nan
+    s, length = dubins.judged(ocp, u, X0)
+    assert length[0] == pytest.approx(4.0)
+    assert math.isinf(length[1])
+    assert not s.success[1]
+
+
+def test_a_feedback_is_rolled_out_for_all_states_at_once():
+    ocp, asked = nocl.load_ocp("dubins"), []
+
+    def controller(x, t):
+        asked.append(len(x))
+        return np.zeros((len(x), 2))
+
+    assert dubins.rollout_ms(ocp, controller, X0) > 0
+    assert asked == [2] * (dubins.INTERVALS + 1)
+
+
+def test_success_needs_the_goal_and_the_obstacle():
+    made = cell("cnd", [4.0] * 3, [1.0] * 3, [0.05, 0.2, 0.05], [0.1, 0.1, -0.01])
+    assert made.success.tolist() == [True, False, False]
+
+
+def test_the_table_compares_with_the_optimum_of_the_same_states():
+    entries = {e.way: e for e in dubins.table([CND, OPTIMUM])}
+    assert list(entries) == ["cnd", "optimum"]
+    assert entries["cnd"].success == pytest.approx(2 / 3)
+    assert entries["cnd"].length == pytest.approx(4.3)
+    assert entries["cnd"].gap == pytest.approx(7.5)
+    assert entries["cnd"].ratio == pytest.approx(4.3 / 4.0)
+    assert entries["optimum"].gap == pytest.approx(0.0)
+    assert math.isnan(dubins.table([CND])[0].gap)
+
+
+def test_tables_and_figure(tmp_path):
+    paths = dubins_tables.write(tmp_path, [cell("rrt-100", [5.0], [0.1], [0.0], [0.2]), CND, OPTIMUM])
+    assert [p.name for p in paths] == ["dubins.md", "dubins.tex", "dubins.csv", "dubins.png"]
+    text = paths[0].read_text()
+    assert "4.887 ± 0.961" in text  # the paper's RRT*
+    rows = list(csv.DictReader(io.StringIO(paths[2].read_text())))
+    assert float(rows[0]["paper_success"]) == 0.889
+    assert rows[1]["paper_success"] == ""
+    (x, y), radius = dubins_tables._obstacle()
+    assert (x, y, radius) == pytest.approx((-1.0, 0.0, 0.5), abs=2e-3)
+
+
+def test_cells_are_kept_and_made_anew_for_another_plan(tmp_path, monkeypatch):
+    made = []
+
+    def way(ocp, x0, seed, plan, folder):
+        made.append(len(x0))
+        return np.tile([0.5, 0.0], (len(x0), 80, 1)), 1.0, "straight on"
+
+    monkeypatch.setitem(dubins.WAYS, "nmpc", replace(dubins.WAYS["nmpc"], make=way))
+    plan = dubins.Plan(n=3, ways=("nmpc",))
+    (first,) = dubins.run(tmp_path, plan, progress=False)
+    (again,) = dubins.run(tmp_path, plan, progress=False)
+    assert made == [3]
+    assert again == first
+    dubins.run(tmp_path, replace(plan, n=4), progress=False)
+    assert made == [3, 4]
+    assert len(dubins.finished(tmp_path)) == 1
+    (tmp_path / "cells" / "dubins-nmpc-0.json").write_text("{}")
+    with pytest.raises(ValueError, match="no cell of the Dubins table"):
+        dubins.run(tmp_path, plan, progress=False)
+
+
+def test_plans_are_checked():
+    with pytest.raises(ValueError, match="some of rrt-100"):
+        dubins.Plan(ways=("prm",))
+    with pytest.raises(ValueError, match="n is 0"):
+        dubins.Plan(n=0)
+    with pytest.raises(ValueError, match="problems are"):
+        approaches.Plan(problems=("boat",))
+
+
+def test_approaches_level_sets_end_where_memory_does(tmp_path):
+    pytest.importorskip("hj_reachability")
+    plan = approaches.Plan(nodes=11, states=8, problems=("double_integrator", "quadrotor"))
+    small = approaches.MAKERS["level-sets"]("double_integrator", plan)
+    large = approaches.MAKERS["level-sets"]("quadrotor", plan)
+    assert small.memory < 10
+    assert small.ms > 0
+    assert large.memory > 1e7  # MB
+    assert "not possible" in large.note
+    text = approaches.write(tmp_path, [small, large])[0].read_text()
+    assert "| quadrotor | 12 | HJB level sets |" in text
