@@ -104,7 +104,8 @@ class Log:
         xdot = np.column_stack([_numbers(table[name], name, path) for name in rates]) if there else None
         x, u = (np.column_stack([numbers[name] for name in names])
                 for names in (system.state_names, system.control_names))
-        return Log.of(system, numbers[TIME], x, u, xdot=xdot, run=table.get(RUN), max_gap=max_gap)
+        runs = [str(label) for label in table[RUN]] if RUN in table else None
+        return Log.of(system, numbers[TIME], x, u, xdot=xdot, run=runs, max_gap=max_gap)
 
     def write(self, path: str | Path) -> Path:
         """Write a CSV or Parquet file that `read` reads; a run's last sample repeats its last control."""
