@@ -360,8 +360,15 @@ function show(id) {
     });
   }
 }
-const near = new IntersectionObserver((entries) => entries.forEach((entry) => {
-  if (entry.isIntersecting && !drawn.has(entry.target.id)) { near.unobserve(entry.target); show(entry.target.id); }
+const waiting = [];  // drawn one at a time, so that the page answers in between
+function drawNext() {
+  const id = waiting.shift();
+  if (id && !drawn.has(id)) show(id);
+  if (waiting.length) setTimeout(drawNext);
+}
+const near = new IntersectionObserver((entries) => entries.filter((entry) => entry.isIntersecting).forEach((entry) => {
+  near.unobserve(entry.target);
+  if (waiting.push(entry.target.id) === 1) setTimeout(drawNext);
 }), {rootMargin: "400px"});
 ["across", "up", "colour"].forEach((id) => $(id).addEventListener("change", drawMap));
 ["phasex", "phasey"].forEach((id) => $(id).addEventListener("change", drawPhase));
