@@ -55,7 +55,7 @@ def speed(rounds: int, steps: int) -> None:
         rows.append({"system": name, "samples_per_second": per_second, "times": round(per_second["nocl"] / best, 2)})
         print(rows[-1], flush=True)
     provenance.write("sysid_speed", rows, batch=BATCH, width=WIDTH, rounds=rounds, steps=steps, threads=1,
-                     clock="CPU time", loss="|f_theta - f| + |grad f_theta - grad f|, full Jacobian, sine, 3 layers, float32")
+                     clock="CPU time", loss="|f_theta - f| + |grad f_theta - grad f|, full Jacobian, sine, 3 layers")
 
 
 def contestants(name: str) -> Iterator[tuple[str, Step]]:
