@@ -23,6 +23,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
 import provenance
+from learned_optimum import FINE, feedback, lost, optimum
 
 import nocl
 from nocl.checks import Array
@@ -31,6 +32,7 @@ from nocl.logs import Log
 from nocl.simulate import simulate
 from nocl.solvers.cnd import TrainSettings
 from nocl.solvers.ddp import DDP
+from nocl.solvers.global_search import solve_globally
 from nocl.sysid import LearnedDynamics, LogSettings, identify
 from nocl.systems import acrobot, pendulum
 
@@ -88,8 +90,6 @@ def unknown(system: nocl.System) -> nocl.System:
 
 def run_acrobot() -> None:
     """Learn, validate on other recordings, then the learned optimum as feedback on the exact acrobot."""
-    from learned_optimum import FINE, feedback, lost, optimum
-
     exact, ocp = acrobot.system(), acrobot.ocp()
     log, clean = recordings(exact, 50, 0.01), recordings(exact, 10, 0.0, seed=1)
     train, test = log.split(0.2)
@@ -143,12 +143,12 @@ def gym_logs(system: nocl.System, episodes: int, steps: int, seed: int = 0) -> L
     return Log.of(system, t, np.column_stack([theta, omega]), u[:, None], run=run.astype(int))
 
 
-def on_gym(controller: Any, x0: Array, steps: int, L: ca.Function, G: ca.Function) -> tuple[Array, Array]:
-    """(cost [B], last state [B, 2]) of a controller (x [B, 2], t) -> u on Pendulum-v1, asked every 0.05 s."""
+def on_gym(controllers: list[Any], x0: Array, steps: int, L: ca.Function, G: ca.Function) -> tuple[Array, Array]:
+    """(cost [B], last state [B, 2]) on Pendulum-v1 of controllers (x [1, 2], t) -> u, one a start, every 0.05 s."""
     import gymnasium
 
     env, costs, ends = gymnasium.make("Pendulum-v1", max_episode_steps=10_000), [], []
-    for start in x0:
+    for controller, start in zip(controllers, x0, strict=True):
         env.reset(seed=0)
         env.unwrapped.state = np.array(start)  # a real one would be let hang
         x, cost = np.array(start), 0.0
@@ -169,27 +169,28 @@ def run_pendulum() -> None:
     theta, omega, torque = (ca.SX.sym(n) for n in ("theta", "omega", "torque"))
     plant = nocl.System("gym_pendulum", x=ca.vertcat(theta, omega), u=torque, xdot=None, lbu=[-2], ubu=[2],
                         lbx=[-np.pi, -8], ubx=[np.pi, 8], angles=["theta"])
-    train, test = gym_logs(plant, 40, 100).split(0.2)
-    model, row = learned(plant, train, test, None, settings=LogSettings(width=24, window=10, steps=12))
+    train, test = gym_logs(plant, 30, 100).split(0.2)
+    model, row = learned(plant, train, test, None, settings=LogSettings(width=20, window=10, steps=8))
     cost = (1 - ca.cos(theta)) + 0.05 * omega**2
     ocp = nocl.OCP(model.to_system(), horizon=5.0, running=cost + 0.01 * torque**2, terminal=10 * cost,
                    x_goal=[0, 0], u_goal=[0], initial_states=nocl.Gaussian(mean=[np.pi, 0], std=[0.1, 0.1]))
     start = time.perf_counter()
-    settings = TrainSettings(intervals=100, seeds=6, starts=6, states=60, tails=500, visits=400, rounds=2,
-                             iterations=700, hidden=(48, 48), held_out=16, value=False)
+    settings = TrainSettings(intervals=100, seeds=8, starts=8, states=100, tails=600, visits=400, rounds=2,
+                             iterations=1000, hidden=(64, 64), held_out=16, value=False)
     cnd = nocl.train(ocp, dynamics=model, settings=settings, seed=0, progress=False)
     row["seconds_train"] = round(time.perf_counter() - start, 1)
     x0 = ocp.initial_states.sample(30, 1)
     row["outside"] = int(model.outside(x0).sum())
-    costs, ends = on_gym(cnd, x0, 100, ocp.L, ocp.G)
-    planned = DDP(ocp, intervals=100, dynamics=model)
-    own = simulate(ocp, cnd, x0, f=model, hold=100).u[:, :-1]  # on the learned dynamics, to start from
-    predicted = planned.solve(x0, u=own).cost
-    tilt = np.abs((ends[:, 0] + np.pi) % (2 * np.pi) - np.pi)
-    row |= {"cost": costs.tolist(), "planned": predicted.tolist(), "upright": int((tilt < 0.1).sum()), "n": len(x0),
-            "tilt": float(tilt.max()), "speed": float(np.abs(ends[:, 1]).max()),
-            "median excess %": float(100 * np.median(costs / predicted - 1))}
-    print({k: v for k, v in row.items() if k not in ("validation", "cost", "planned")}, flush=True)
+    planned = solve_globally(DDP(ocp, intervals=100, dynamics=model), x0, starts=8, seed=0).best
+    row["n"] = len(x0)
+    each = [feedback(planned[i: i + 1]) for i in range(len(x0))]
+    for name, controllers in (("CND", [cnd] * len(x0)), ("DDP", each)):
+        costs, ends = on_gym(controllers, x0, 100, ocp.L, ocp.G)
+        tilt = np.abs((ends[:, 0] + np.pi) % (2 * np.pi) - np.pi)
+        row[name] = {"upright": int((tilt < 0.1).sum()), "tilt": float(np.median(tilt)),
+                     "worst tilt": float(tilt.max()), "speed": float(np.abs(ends[:, 1]).max()),
+                     "excess % over the plan": float(100 * np.median(costs / planned.cost - 1))}
+    print({k: v for k, v in row.items() if k != "validation"}, flush=True)
     provenance.write("logged_pendulum", [row])
 
 
