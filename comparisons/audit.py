@@ -34,9 +34,12 @@ def audit(report: Report, methods: Mapping[str, Any], model: Any = None) -> tupl
     model: the dynamics that the controls were made on, a casadi.Function (x, u) -> xdot or an object with
     `to_casadi()`; without one the rollouts on it are missing.
     """
+    from nocl.threads import one_thread  # with torch
+
     learned = None if model is None else dynamics_function(report.ocp, model)
-    return tuple(_audit(report, judged, methods[judged.name], learned) for judged in report.judged
-                 if judged.name in methods)
+    with one_thread():
+        return tuple(_audit(report, judged, methods[judged.name], learned) for judged in report.judged
+                     if judged.name in methods)
 
 
 def _audit(report: Report, judged: Judged, method: Any, learned: ca.Function | None) -> MethodAudit:
