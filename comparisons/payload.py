@@ -7,6 +7,7 @@ greatest value, an error of at most 1 / 131068 of that range: far below a pixel.
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Callable
 from itertools import combinations
 from typing import Any
@@ -17,7 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from nocl.checks import Array
 from nocl.comparisons.explain import explained_method
+from nocl.comparisons.findings import MethodAudit
 from nocl.comparisons.report import Judged, Report
+from nocl.comparisons.tables import AUDITED
 from nocl.ocp import OCP
 
 NODES = {81: 1_500_000, 41: 2_500_000, 21: 3_700_000}  # times of a run, and the characters that all runs may take then
@@ -227,9 +230,18 @@ def _slice(owner: Judged, base: Array, pair: tuple[int, ...], low: Array, high: 
     return _values(owner, x, t).reshape(GRID, GRID)
 
 
+def _audit(audit: MethodAudit) -> dict[str, Any]:
+    """What an audit says of each state, by the names that rows have, in the words of the table of audits."""
+    rows, words = audit.rows(), dict(AUDITED)
+    keys = [key for key in rows[0] if any(not math.isnan(row[key]) for row in rows)]
+    return {"method": audit.method, "keys": [words.get(key, key) for key in keys],
+            "values": floats([[row[key] for key in keys] for row in rows])}
+
+
 def _study(report: Report) -> dict[str, Any]:
     """What a study found beyond costs, where it did."""
     parts: list[tuple[str, Callable[[], Any]]] = [
+        ("audits", lambda: [_audit(audit) for audit in report.audits]),
         ("robustness", lambda: [] if report.robustness is None else [
             {"name": s.name, "losses": [{"method": x.method, "lost": floats(x.lost)} for x in s.losses]}
             for s in report.robustness.scenarios]),

@@ -365,6 +365,8 @@ def test_the_page_in_a_browser(browser, saved):
     assert chosen != state
     assert w.curves() != before
     assert f"State {chosen}:" in w.page.inner_text("#which")
+    assert "audit of LQR" in w.page.inner_text("#audit")
+    assert "|V - J|" in w.page.inner_text("#audit")
     clicked = w.curves()
     w.page.click("#next")
     assert w.curves() != clicked

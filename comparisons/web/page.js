@@ -119,12 +119,18 @@ function outcome(m) {
           ...cells, `${(100 * number(m, state, 4)).toFixed(0)} %`, ...(Number.isFinite(clearance) || hasPath ? [text(clearance)] : []),
           text(number(m, state, 6)), text(number(m, state, 7))];
 }
+const AUDITS = D.audits.map((audit) => ({method: audit.method, keys: audit.keys, values: floats(audit.values)}));
 const hasPath = NUMBERS.some((values) => values.some((v, k) => k % 8 === 5 && Number.isFinite(v)));
 function drawOutcome() {
   const head = ["method", "gap", "cost", "running", "terminal", "|x(T) - x*|", "at a bound", ...(hasPath ? ["clearance"] : []),
                 "ms, first", "ms, later"];
   const rows = D.methods.map((_, m) => "<tr>" + outcome(m).map((cell) => `<td>${cell}</td>`).join("") + "</tr>");
   $("outcome").innerHTML = `<table><thead><tr>${head.map((h) => `<th>${h}</th>`).join("")}</tr></thead><tbody>${rows.join("")}</tbody></table>`;
+  $("audit").innerHTML = AUDITS.map((audit) => {
+    const n = audit.keys.length, values = Array.from(audit.values.slice(state * n, (state + 1) * n));
+    return `<table><thead><tr><th>audit of ${safe(audit.method)}</th>${audit.keys.map((key) => `<th>${safe(key)}</th>`).join("")}</tr></thead>` +
+           `<tbody><tr><td></td>${values.map((v) => `<td>${text(v)}</td>`).join("")}</tr></tbody></table>`;
+  }).join("");
   const start = D.states.map((name, k) => `${name} ${text(x0(state, k))}`).join(", ");
   $("which").textContent = `State ${state}: ${start}` + (D.best[state] >= 0 ? `. Best known by ${D.methods[D.best[state]].name}` : "");
   $("number").value = state;
