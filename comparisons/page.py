@@ -154,6 +154,7 @@ a cross failed or violates a path constraint.</figcaption></figure>
 <div id=panel><div class=controls><h3 id=which></h3><button id=previous aria-label="previous state">&lsaquo;</button>
 <label>state <input id=number type=number min=0 step=1></label><button id=next aria-label="next state">&rsaquo;</button>
 </div><div id=outcome class=scroll tabindex=0></div><div id=audit class=scroll tabindex=0></div>
+<label><input id=models type=checkbox> the same control on the learned model and under RK4</label>
 <figure><div id=runs class="plot"></div><figcaption>States and controls of every method on the exact dynamics. Grey
 dots: the goal; grey dashes: the bounds of a control.</figcaption></figure>
 <div class=pair><figure><div id=along class="plot"></div><figcaption id=alongnote></figcaption></figure>

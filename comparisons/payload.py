@@ -18,12 +18,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from nocl.checks import Array
 from nocl.comparisons.explain import explained_method
-from nocl.comparisons.findings import MethodAudit
+from nocl.comparisons.findings import MethodAudit, Rollouts
 from nocl.comparisons.report import Judged, Report
 from nocl.comparisons.tables import AUDITED
 from nocl.ocp import OCP
 
 NODES = {81: 1_500_000, 41: 2_500_000, 21: 3_700_000}  # times of a run, and the characters that all runs may take then
+ROLLOUTS = 1_500_000  # characters that the audits' rollouts may take: left out where they take more
 MISSING = 65535  # the 16-bit step that stands for NaN
 PAIRS = 6  # of coordinates that V is drawn over
 TIMES = (0.0, 0.5, 0.9)  # of the horizon that V is drawn at
@@ -230,18 +231,31 @@ def _slice(owner: Judged, base: Array, pair: tuple[int, ...], low: Array, high: 
     return _values(owner, x, t).reshape(GRID, GRID)
 
 
-def _audit(audit: MethodAudit) -> dict[str, Any]:
+def _rollout_nodes(report: Report) -> int:
+    """Times that the audits' rollouts are kept at: all of them fit, or 0."""
+    runs = sum(len(audit.rollouts) for audit in report.audits) * len(report.x0)
+    fits = (nodes for nodes in NODES if runs * (nodes + 4) * report.ocp.system.nx * 2 * 4 / 3 <= ROLLOUTS)
+    return next(fits, 0)
+
+
+def _rollout(rollout: Rollouts, nodes: int) -> dict[str, Any]:
+    index = np.unique(np.rint(np.linspace(0, len(rollout.t) - 1, min(nodes, len(rollout.t)))).astype(int))
+    return {"name": rollout.name, "t": rollout.t[index].tolist(), **quantised(rollout.x[:, index])}
+
+
+def _audit(audit: MethodAudit, nodes: int) -> dict[str, Any]:
     """What an audit says of each state, by the names that rows have, in the words of the table of audits."""
     rows, words = audit.rows(), dict(AUDITED)
     keys = [key for key in rows[0] if any(not math.isnan(row[key]) for row in rows)]
     return {"method": audit.method, "keys": [words.get(key, key) for key in keys],
-            "values": floats([[row[key] for key in keys] for row in rows])}
+            "values": floats([[row[key] for key in keys] for row in rows]),
+            "rollouts": [_rollout(rollout, nodes) for rollout in audit.rollouts] if nodes else []}
 
 
 def _study(report: Report) -> dict[str, Any]:
     """What a study found beyond costs, where it did."""
     parts: list[tuple[str, Callable[[], Any]]] = [
-        ("audits", lambda: [_audit(audit) for audit in report.audits]),
+        ("audits", lambda: [_audit(audit, _rollout_nodes(report)) for audit in report.audits]),
         ("robustness", lambda: [] if report.robustness is None else [
             {"name": s.name, "losses": [{"method": x.method, "lost": floats(x.lost)} for x in s.losses]}
             for s in report.robustness.scenarios]),

@@ -341,7 +341,7 @@ class Watched:
         raise AssertionError(f"never {condition}")
 
     def curves(self):
-        return [e.get_attribute("d") for e in self.page.query_selector_all("#runs path.js-line")]
+        return [e.get_attribute("d") for e in self.page.query_selector_all("#runs .scatterlayer path.js-line")]
 
     def outside(self):
         return [url for url in self.requests if not url.startswith(("data:", "blob:"))][1:]  # the first is the page
@@ -367,6 +367,10 @@ def test_the_page_in_a_browser(browser, saved):
     assert f"State {chosen}:" in w.page.inner_text("#which")
     assert "audit of LQR" in w.page.inner_text("#audit")
     assert "|V - J|" in w.page.inner_text("#audit")
+    before = w.curves()
+    w.page.check("#models")
+    assert len(w.curves()) == len(before) + 4  # one rollout's four states
+    w.page.uncheck("#models")
     clicked = w.curves()
     w.page.click("#next")
     assert w.curves() != clicked

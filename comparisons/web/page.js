@@ -27,12 +27,11 @@ const gap = (m, i) => GAP[m * B + i];
 const NUMBERS = D.methods.map((method) => floats(method.numbers));
 const number = (m, i, k) => NUMBERS[m][i * 8 + k];
 const place = new Map((D.kept || Array.from({length: B}, (_, i) => i)).map((i, row) => [i, row]));
-const opened = [];
-function run(m, i) {  // [channel][node] of a method's run from state i, null where it is not kept
-  if (!place.has(i)) return null;
-  const method = D.methods[m], K = method.t.length;
-  opened[m] = opened[m] || {steps: new Uint16Array(bytes(method.runs).buffer), limits: floats(method.limits)};
-  const {steps, limits} = opened[m], C = limits.length / 2 / place.size, row = place.get(i);
+const opened = new Map();
+const run = (m, i) => place.has(i) ? unpacked(D.methods[m], place.get(i), place.size) : null;
+function unpacked(entry, row, rows) {  // [channel][node] of one of the packed runs
+  if (!opened.has(entry)) opened.set(entry, {steps: new Uint16Array(bytes(entry.runs).buffer), limits: floats(entry.limits)});
+  const {steps, limits} = opened.get(entry), C = limits.length / 2 / rows, K = entry.t.length;
   return Array.from({length: C}, (_, c) => {
     const low = limits[(row * C + c) * 2], width = limits[(row * C + c) * 2 + 1] - low;
     return Array.from({length: K}, (_, k) => {
@@ -119,7 +118,7 @@ function outcome(m) {
           ...cells, `${(100 * number(m, state, 4)).toFixed(0)} %`, ...(Number.isFinite(clearance) || hasPath ? [text(clearance)] : []),
           text(number(m, state, 6)), text(number(m, state, 7))];
 }
-const AUDITS = D.audits.map((audit) => ({method: audit.method, keys: audit.keys, values: floats(audit.values)}));
+const AUDITS = D.audits.map((audit) => ({...audit, values: floats(audit.values)}));
 const hasPath = NUMBERS.some((values) => values.some((v, k) => k % 8 === 5 && Number.isFinite(v)));
 function drawOutcome() {
   const head = ["method", "gap", "cost", "running", "terminal", "|x(T) - x*|", "at a bound", ...(hasPath ? ["clearance"] : []),
@@ -161,6 +160,14 @@ function drawRuns() {
       name: MNAMES[m], legendgroup: String(m), showlegend: k === 0, hovertemplate: `${MNAMES[m]}: %{y:.4g}<extra>t = %{x:.3g}</extra>`,
       line: line(m, k >= nx && D.methods[m].held ? {shape: "hv"} : {})}));
   }
+  if ($("models").checked) AUDITS.forEach((audit) => audit.rollouts.forEach((rollout, c) => {
+    const r = unpacked(rollout, state, B), m = D.methods.findIndex((method) => method.name === audit.method);
+    for (let k = 0; k < nx; k++) {
+      const id = k ? String(k + 1) : "", name = safe(`${audit.method} on the ${rollout.name}`);
+      traces.push({type: "scatter", mode: "lines", x: rollout.t, y: r[k], xaxis: "x" + id, yaxis: "y" + id, name, legendgroup: name,
+        showlegend: k === 0, hovertemplate: `${name}: %{y:.4g}<extra>t = %{x:.3g}</extra>`, line: {color: colour(m < 0 ? M : m), width: 1.2, dash: DASH[3 - c % 2]}, opacity: 0.75});
+    }
+  }));
   if (!traces.length) extra.annotations.push({text: "the runs of this state are not kept in this page", x: 0.5, y: 0.5,
                                               xref: "paper", yref: "paper", showarrow: false, font: {size: 16}});
   extra.legend = {orientation: "h", x: 0, xref: "paper", y: 1 + 6 / (extra.height - 72), yanchor: "bottom", bgcolor: "rgba(0,0,0,0)"};
@@ -380,6 +387,8 @@ const near = new IntersectionObserver((entries) => entries.filter((entry) => ent
 ["phasex", "phasey"].forEach((id) => $(id).addEventListener("change", drawPhase));
 if (D.slices) ["slicepair", "slicetime"].forEach((id) => $(id).addEventListener("change", drawSlice));
 if (D.regions.length) ["regionof", "regionx", "regiony"].forEach((id) => $(id).addEventListener("change", drawRegionMap));
+$("models").parentElement.hidden = !AUDITS.some((audit) => audit.rollouts.length);
+$("models").addEventListener("change", drawRuns);
 $("number").addEventListener("change", () => choose(Number($("number").value)));
 $("previous").addEventListener("click", () => choose((state + B - 1) % B));
 $("next").addEventListener("click", () => choose((state + 1) % B));
