@@ -111,9 +111,10 @@ def _neighbours(report: Report, ways: _Ways, m: int, i: int) -> Iterator[str]:
     yield (f"{name}'s {count(len(near), 'nearest neighbour')} {what}: "
            + ("this state is on its own." if lone else "a region, not a point."))
     b = _best(report, i)
+    if b is None or not ways.another(m, b, i):
+        return
     others = [(n, _best(report, n)) for n in near]
-    away = sum(b is not None and c is not None and ways.part(b, i, c, n) for n, c in others)
-    if away:
+    if away := sum(c is not None and ways.part(b, i, c, n) for n, c in others):
         yield f"The best known runs of {away} of these {len(near)} part from this state's: basins meet here."
 
 
@@ -142,6 +143,10 @@ class _Ways:
         d = np.abs(self.z[m] - self.z[b]).max(axis=(1, 2))
         return float(np.median(d[np.isfinite(d)])) if np.isfinite(d).any() else 0.0
 
+    def another(self, m: int, b: int, i: int) -> bool:
+        """Whether method m's run from state i goes another way than b's."""
+        return bool(np.abs(self.z[m][i] - self.z[b][i]).max() > max(APART, FAR * self.usual(m, b)))
+
     def compared(self, m: int, b: int, i: int) -> str:
         """Whether m's run goes b's way, and where they are farthest apart."""
         d = np.abs(self.z[m][i] - self.z[b][i])
@@ -153,8 +158,8 @@ class _Ways:
         unit = system.units.get(name, "")
         gap = float((self.z[m][i] - self.z[b][i])[node, k] * self.sd[k])
         where = f"farthest apart in {name} at t = {self.t[node]:.3g}, by {number(gap)}{' ' + unit if unit else ''}"
-        other = d.max() > max(APART, FAR * self.usual(m, b))
-        return f"It goes {'another way than the best run' if other else 'the best known way'} ({where})."
+        way = "another way than the best run" if self.another(m, b, i) else "the best known way"
+        return f"It goes {way} ({where})."
 
 
 def _nearest(x0: Array) -> list[list[int]]:

@@ -196,6 +196,7 @@ def test_the_worst_state_is_explained():
     said = " ".join(first.sentences)
     assert first.state == 5
     assert first.gap == pytest.approx(100 * 0.7 / 1.2)
+    assert "basins" not in said  # the neighbours' best runs go the way of this state's
     for text in ("by theirs: 58.3 % more", "Lost in the terminal cost (running +0, terminal +0.7)",
                  "another way than the best run", "this state is on its own"):
         assert text in said
