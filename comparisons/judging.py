@@ -159,7 +159,7 @@ def judge(job: Judging, workers: int | str, out: Path | None, progress: bool | N
     B = len(job.x0)
     rows = np.array_split(np.arange(B), min(B, PARTS))
     parts = [Part(f"run-{m}-{i:02d}", m, part) for i, part in enumerate(rows) for m in range(len(job.runs))]
-    journal = Journal(out, _key(job) if out is not None else "", "a comparison")
+    journal = Journal(out, key_of(job) if out is not None else "", "a comparison")
     show = sys.stderr.isatty() if progress is None else progress
     done = do(job, parts, Pool(_possible(job, workers)), journal, show, what)
     return [joined(job.ocp, [outcome.judgement for part, outcome in zip(parts, done, strict=True) if part.run == m])
@@ -179,7 +179,7 @@ def _possible(job: Judging, workers: int | str) -> int | str:
     return workers
 
 
-def _key(job: Judging) -> str:
+def key_of(job: Judging) -> str:
     """A fingerprint of all that outcomes depend on; plain callables are known by name."""
     d = job.disturbance
     arrays = [part for run in job.runs for part in run.identity] + [a for kick in d.kicks for a in kick]

@@ -201,7 +201,7 @@ def _off_grid(ocp: OCP, solution: Any) -> str:
 
 def solve(solver: Any, name: str, x0: Array, solving: Solving) -> list[tuple[Any, float] | str]:
     """(Solution, seconds a state) of all states at once; where that raises, state by state, what was raised instead."""
-    out = None if solving.out is None else solving.out / "solves" / "".join(c if c.isalnum() else "_" for c in name)
+    out = None if solving.out is None else solving.out / "solves" / folder_name(name)
     given = {"workers": solving.workers, "out": out, "progress": solving.progress}
     takes = inspect.signature(solver.solve).parameters
     options = {key: value for key, value in given.items() if key in takes}
@@ -247,6 +247,11 @@ def _unsolved(ocp: OCP, solution: Any) -> list[str]:
     outcome = zip(solution.success, solution.message, strict=True)
     off_grid = _off_grid(ocp, solution)
     return [off_grid if ok else f"not solved: {why}" for ok, why in outcome]
+
+
+def folder_name(name: str) -> str:
+    """A name as a folder's; different names give different ones."""
+    return "".join(c if c.isascii() and c.isalnum() else f"_{ord(c):x}_" for c in name)
 
 
 def said(error: Exception) -> str:

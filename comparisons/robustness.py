@@ -21,8 +21,8 @@ from numpy.typing import ArrayLike
 from nocl import checks
 from nocl.checks import Array
 from nocl.comparisons.findings import Loss, Robustness, Scenario
-from nocl.comparisons.judging import Disturbance, Judgement, Judging, judge
-from nocl.comparisons.methods import Run, Solving, at_rate, checked, how, runs_of
+from nocl.comparisons.judging import Disturbance, Judgement, Judging, judge, key_of
+from nocl.comparisons.methods import Run, Solving, at_rate, checked, folder_name, how, runs_of
 from nocl.comparisons.reference import SLOTS, Reference, resolved
 from nocl.comparisons.report import VIOLATION
 from nocl.ocp import OCP
@@ -174,7 +174,7 @@ class _Study:
                 zip(runs, delays or [0.0] * len(runs), strict=True)]
         job = Judging(self.ocp, self.x0, list(runs), Disturbance(seed=self.settings.seed, **disturbance), late,
                       timed=name == "undisturbed")
-        folder = None if self.out is None else self.out / "".join(c if c.isalnum() else "_" for c in name)
+        folder = None if self.out is None else self.out / f"{folder_name(name)}-{key_of(job)[:12]}"
         return judge(job, self.workers, folder, self.progress, name)
 
     def scenario(self, name: str, text: str, runs: Sequence[Run], judgements: Sequence[Judgement], best: Array,

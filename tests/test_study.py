@@ -259,6 +259,15 @@ def test_a_variant_may_be_a_system_a_problem_or_a_function(ocp):
         Disturbances(kicks=0)
 
 
+def test_disturbances_resume_from_a_folder(ocp, tmp_path):
+    x0, law = ocp.initial_states.sample(2, 1), {"LQR": LQR(ocp)}
+    first, again = (robustness(ocp, law, x0, mass_variants(ocp), Disturbances(hold=20), out=tmp_path, progress=False)
+                    for _ in range(2))
+    for a, b in zip(first.scenarios, again.scenarios, strict=True):
+        np.testing.assert_array_equal(a.losses[0].cost, b.losses[0].cost)
+    assert list(tmp_path.iterdir())
+
+
 def test_losses_of_failures_and_of_unknown_optima():
     loss = Loss("m", "how", np.array([1.1, np.inf, 1.0]), np.array([1.0, 1.0, np.inf]), np.array([True, False, True]),
                 np.zeros(3))
