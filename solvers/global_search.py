@@ -29,11 +29,12 @@ from nocl import checks
 from nocl.checks import Array
 from nocl.ocp import OCP
 from nocl.sampling import Seed
+from nocl.simulate import dynamics_function
 from nocl.solvers.bank import SolutionBank, spread
 from nocl.solvers.compiled import fingerprint
 from nocl.solvers.ddp import DDP, DDPSolution
 from nocl.solvers.ddp_batch import bytes_each
-from nocl.solvers.guesses import mirrored, mirrors
+from nocl.solvers.guesses import jacobian_of, mirrored, mirrors
 from nocl.solvers.search import SAME, TINY, distinct
 
 Rows = NDArray[np.int64]
@@ -136,7 +137,7 @@ class _Search:
         if known is not None:
             self._merge(np.arange(len(x0)), known)
         self.near: tuple[Rows, Rows, Array] | None = None  # each state's neighbours: state, image, cost when tried
-        self.mirrors = mirrors(ddp.ocp)
+        self.mirrors = mirrors(ddp.ocp, ddp.dynamics)
         self._resume()
 
     @cached_property
@@ -315,7 +316,7 @@ class Holds:
 
     def __init__(self, ddp: DDP, rng: np.random.Generator) -> None:
         self.ddp, K, nx = ddp, ddp.intervals, ddp.ocp.system.nx
-        z = equilibria(ddp.ocp, DRAWS, rng)
+        z = equilibria(ddp.ocp, DRAWS, rng, ddp.dynamics)
         self.x, self.u = np.repeat(z[:, None, :nx], K + 1, axis=1), np.repeat(z[:, None, nx:], K, axis=1)
         self.gain = ddp.feedback(self.x, self.u)
 
@@ -336,29 +337,31 @@ class Holds:
         return {"u": np.clip(u, s.lbu, s.ubu), "x": self.x[rows], "gain": gain}
 
 
-def equilibria(ocp: OCP, draws: int, rng: np.random.Generator) -> Array:
+def equilibria(ocp: OCP, draws: int, rng: np.random.Generator, dynamics: Any = None) -> Array:
     """(x*, u*), then points of X and U where f = 0, by Gauss-Newton steps from random ones [n, nx + nu]."""
     s = ocp.system
-    if s.xdot is None:  # a plant that is not known: no other equilibria are
-        return np.r_[ocp.x_goal, ocp.u_goal][None]
+    goal = np.r_[ocp.x_goal, ocp.u_goal][None]
+    if s.xdot is None and dynamics is None:  # a plant that is not known: no other equilibria are
+        return goal
     low, high = np.r_[s.lbx, s.lbu], np.r_[s.ubx, s.ubu]
+    f = dynamics_function(ocp, dynamics)
+    slope = jacobian_of(f)
+
+    def linear(z: Array) -> tuple[Array, Array]:
+        x, u = np.split(z.T, [s.nx])
+        J = slope.map(len(z))(x, u).full().reshape(s.nx, len(z), -1).transpose(1, 0, 2)
+        return f.map(len(z))(x, u).full().T, J
+
     z = rng.uniform(low, high, (draws, len(low)))
     for _ in range(NEWTON):
-        f, A, B = _linear(ocp, z)
-        fine = np.isfinite(f).all(axis=1) & np.isfinite(A).all(axis=(1, 2)) & np.isfinite(B).all(axis=(1, 2))
-        z, f, J = z[fine], f[fine], np.concatenate([A, B], axis=2)[fine]
-        z = z - np.einsum("bij,bj->bi", np.linalg.pinv(J, rcond=1e-8), f)
+        if not len(z):
+            return goal
+        value, J = linear(z)
+        fine = np.isfinite(value).all(axis=1) & np.isfinite(J).all(axis=(1, 2))
+        z = z[fine] - np.einsum("bij,bj->bi", np.linalg.pinv(J[fine], rcond=1e-8), value[fine])
     inside = (z >= low).all(axis=1) & (z <= high).all(axis=1)
-    still = np.abs(_linear(ocp, z)[0]).max(axis=1) < 1e-8 if len(z) else inside
-    return np.vstack([np.r_[ocp.x_goal, ocp.u_goal], z[inside & still]])
-
-
-def _linear(ocp: OCP, z: Array) -> tuple[Array, Array, Array]:
-    """f [n, nx] and its Jacobians [n, nx, nx], [n, nx, nu] at points z [n, nx + nu]."""
-    s, n = ocp.system, len(z)
-    x, u = z[:, :s.nx].T, z[:, s.nx:].T
-    A, B = (m.full().reshape(s.nx, n, -1).transpose(1, 0, 2) for m in s.jacobian.map(n)(x, u))
-    return s.f(x, u).full().T, A, B
+    still = np.abs(linear(z)[0]).max(axis=1) < 1e-8 if len(z) else inside
+    return np.vstack([goal, z[inside & still]])
 
 
 def cold_controls(ddp: DDP, n: int, seed: Seed) -> Array:

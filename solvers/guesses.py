@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -13,6 +14,7 @@ from scipy.sparse.csgraph import connected_components
 from nocl.checks import Array
 from nocl.data import Controller
 from nocl.ocp import OCP
+from nocl.simulate import dynamics_function
 from nocl.solvers.lqr import LQR
 from nocl.solvers.transcription import Transcription
 
@@ -26,6 +28,7 @@ LARGEST = 10  # groups of coordinates up to which mirror images of the problem a
 PROBES = 5  # states that a mirror image must hold at
 ROUNDING = 1e-9  # of the largest: a derivative that counts as none
 EQUAL = 1e-10  # relative difference of equal costs and derivatives
+LEARNED = 1e-3  # ... of a learned f: an image is where a solve starts from, no more
 
 
 def starts(program: Transcription, lqr: LQR | None, x0: Array, t: Array, n: int, seed: int) -> list[Guess]:
@@ -147,16 +150,17 @@ def _across(gradients: ca.DM, i: int, along: Array) -> Array | None:
     return best / np.linalg.norm(best) * np.linalg.norm(e)
 
 
-def mirrors(ocp: OCP) -> list[tuple[Array, Array]]:
+def mirrors(ocp: OCP, dynamics: Any = None) -> list[tuple[Array, Array]]:
     """Signs (of x - x* [nx], of u - u* [nu]) under which f, L, G, h and U stay what they are, other than all +1.
 
-    Found by trial at random points, so up to rounding; none are looked for with more than LARGEST groups of
-    coordinates that f, L and G couple at the goal, and so must share a sign.
+    Found by trial at random points, so up to rounding, or with `dynamics` in place of f up to LEARNED; none are looked
+    for with more than LARGEST groups of coordinates that f, L and G couple at the goal, and so must share a sign.
     """
-    s = ocp.system
-    if s.xdot is None:  # a plant that is not known: no symmetry is
+    s, equal = ocp.system, EQUAL if dynamics is None else LEARNED
+    if s.xdot is None and dynamics is None:  # a plant that is not known: no symmetry is
         return []
-    group = _coupled(ocp)
+    f_of = dynamics_function(ocp, dynamics)
+    group = _coupled(ocp, f_of, ROUNDING if dynamics is None else LEARNED)
     if group.max() >= LARGEST:
         return []
     rng, n = np.random.default_rng(0), s.nx
@@ -166,7 +170,7 @@ def mirrors(ocp: OCP) -> list[tuple[Array, Array]]:
 
     def everything(signs: Array) -> Array:
         x, u = np.split((z * signs + goal).T, [n])
-        f = s.f(x, u).full() * signs[:n, None]
+        f = f_of(x, u).full() * signs[:n, None]
         return np.vstack([f, ocp.L(x, u).full(), ocp.G(x).full(), np.sort(ocp.h(x).full(), axis=0)])
 
     same, found = everything(np.ones(n + s.nu)), []
@@ -174,22 +178,28 @@ def mirrors(ocp: OCP) -> list[tuple[Array, Array]]:
         signs = np.array(flips)[group]
         if (signs > 0).all() or np.abs(middle[signs[n:] < 0]).max(initial=0.0) > 0:
             continue
-        if np.abs(everything(signs) - same).max() <= EQUAL * np.abs(same).max():
+        if np.abs(everything(signs) - same).max() <= equal * np.abs(same).max():
             found.append((signs[:n], signs[n:]))
     return found
 
 
-def _coupled(ocp: OCP) -> NDArray[np.int32]:
+def _coupled(ocp: OCP, f: ca.Function, rounding: float) -> NDArray[np.int32]:
     """A number for each of (x, u), equal where f's Jacobian or a Hessian of L or G at the goal couples them."""
     s = ocp.system
     n, z = s.nx, ca.vertcat(s.x, s.u)
     H = ca.hessian(ocp.running, z)[0] + ca.diagcat(ca.hessian(ocp.terminal, s.x)[0], ca.SX(s.nu, s.nu))
-    links = ca.Function("links", [s.x, s.u], [ca.jacobian(s.f(s.x, s.u), z), H])
-    A, H = (part.full() for part in links(ocp.x_goal, ocp.u_goal))
+    H = ca.Function("hessians", [s.x, s.u], [H])(ocp.x_goal, ocp.u_goal).full()
+    A = jacobian_of(f)(ocp.x_goal, ocp.u_goal).full()
     scale = np.r_[s.ubx - s.lbx, s.ubu - s.lbu]
     A, H = np.abs(A * scale) / scale[:n, None], np.abs(H * np.outer(scale, scale))
     H[:n] += A
-    return np.asarray(connected_components(ROUNDING * H.max() < H, directed=False)[1])
+    return np.asarray(connected_components(rounding * H.max() < H, directed=False)[1])
+
+
+def jacobian_of(f: ca.Function) -> ca.Function:
+    """(x, u) -> df/d(x, u) [nx, nx + nu] of an f:(x, u) -> xdot, symbolic or learned."""
+    x, u = f.mx_in()
+    return ca.Function("jacobian", [x, u], [ca.densify(ca.horzcat(*(ca.jacobian(f(x, u), v) for v in (x, u))))])
 
 
 def mirrored(ocp: OCP, mirror: tuple[Array, Array], x: Array, u: Array) -> Guess:

@@ -32,6 +32,8 @@ from nocl.solvers.sensitivity import dense, second_variation
 from nocl.solvers.transcription import BACKENDS, Transcription
 
 BETTER = 1e-6  # relative improvement that makes a neighbour's solution worth passing on
+FRESH = 2  # more random starts in a round, for a state of whose solves a share below SURE ended at its best
+SURE = 0.3
 KEPT = 32  # programs kept in memory
 
 
@@ -117,6 +119,11 @@ class NMPC:
         """The nonlinear program, built once for each problem and settings."""
         where = "" if self.compiled is False else folder_of(self.compiled)
         return _program(_Recipe(self.key + where, self))
+
+    @cached_property
+    def mirrors(self) -> list[tuple[Array, Array]]:
+        """Mirror images of the problem, as signs of x - x* and u - u*."""
+        return starting.mirrors(self.ocp, self.dynamics)
 
     def solve(self, x0: ArrayLike, guesses: Any = None, *, t0: float = 0.0, nodes: ArrayLike | None = None,
               starts: int | None = None, gains: bool = False, workers: int | str = "auto",
@@ -222,11 +229,6 @@ def _lqr(ocp: OCP) -> LQR | None:
     return starting.lqr_of(ocp)
 
 
-@lru_cache(maxsize=KEPT)
-def _mirrors(ocp: OCP) -> list[tuple[Array, Array]]:
-    return starting.mirrors(ocp)
-
-
 def _terminal(ocp: OCP, terminal: Any) -> ca.Function | None:
     """The terminal cost as a casadi.Function (x) or (x, t) -> number."""
     if terminal is None:
@@ -278,7 +280,7 @@ class _Run:
             tasks = [Task(f"round-{round_}-{i:06d}", i, self.x0[i], self.t, guesses)
                      for i, search in enumerate(self.searches)
                      if not search.refusal and (guesses := [*self._from_neighbours(i, order[i], tried),
-                                                            *self._from_afar(i, round_)])]
+                                                            *self._from_afar(i, round_), *self._fresh(i, round_)])]
             before = [search.cost for search in self.searches]
             self._do(tasks, f"neighbours, round {round_}")
             if not any(search.cost < cost - max(BETTER * abs(search.cost), TINY)
@@ -289,7 +291,7 @@ class _Run:
         """(state, mirror image of it, or -1 for the state itself), by their distance from state i; never itself."""
         scale = np.where(np.ptp(self.x0, axis=0) > 0, np.ptp(self.x0, axis=0), 1.0)
         u = np.zeros(self.nmpc.ocp.system.nu)
-        images = [self.x0] + [starting.mirrored(self.nmpc.ocp, g, self.x0, u)[0] for g in _mirrors(self.nmpc.ocp)]
+        images = [self.x0] + [starting.mirrored(self.nmpc.ocp, g, self.x0, u)[0] for g in self.nmpc.mirrors]
         distance = np.linalg.norm((np.array(images) - self.x0[i]) / scale, axis=2)  # [1 + mirrors, B]
         for place in np.argsort(distance, axis=None, kind="stable"):
             image, j = divmod(int(place), len(self.x0))
@@ -306,7 +308,7 @@ class _Run:
             tried.add((i, j, image, answer.cost))
             x, u = answer.x, answer.u
             if image >= 0:
-                x, u = starting.mirrored(self.nmpc.ocp, _mirrors(self.nmpc.ocp)[image], x, u)
+                x, u = starting.mirrored(self.nmpc.ocp, self.nmpc.mirrors[image], x, u)
             yield starting.from_neighbour(self.x0[i], x, u)
 
     def _from_afar(self, i: int, round_: int) -> Iterator[Guess]:
@@ -317,6 +319,14 @@ class _Run:
             answer = self.searches[rng.choice(others)].best
             assert answer is not None
             yield starting.from_neighbour(self.x0[i], answer.x, answer.u)
+
+    def _fresh(self, i: int, round_: int) -> Iterator[Guess]:
+        """More random controls for a state of whose solves few ended at its best."""
+        nmpc, search = self.nmpc, self.searches[i]
+        if search.hits < SURE * len(search.costs):
+            seed = int(np.random.default_rng((nmpc.seed, round_, i, 1)).integers(2**62))
+            for u in starting.random_controls(nmpc.ocp, nmpc.intervals, FRESH, seed):
+                yield starting.controlled(nmpc.program, self.x0[i], u, self.t)
 
     def _do(self, tasks: Sequence[Task], what: str) -> None:
         for outcome in do(_Job(self.nmpc), tasks, self.pool, self.journal, self.show, what):

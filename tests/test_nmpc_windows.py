@@ -207,6 +207,8 @@ def test_mirror_images_and_sides():
     ocp = nocl.load_ocp("dubins")
     assert [(x.tolist(), u.tolist()) for x, u in guesses.mirrors(ocp)] == [([1, -1, -1], [1, -1])]
     assert len(guesses.mirrors(nocl.load_ocp("cartpole"))) == 1
+    shifted = ca.Function("f", [ocp.system.x, ocp.system.u], [ocp.system.f(ocp.system.x, ocp.system.u) + 0.1])
+    assert not guesses.mirrors(ocp, shifted)  # those of the dynamics that are solved with, not of the exact ones
     assert {tuple(x[:3]) for x, _ in guesses.mirrors(nocl.load_ocp("quadrotor"))} == {
         (-1, 1, 1), (1, -1, 1), (-1, -1, 1)}  # not up and down: there is gravity
     assert not any((x < 0).any() for x, _ in guesses.mirrors(walled()))  # the wall stands on one side
