@@ -4,7 +4,8 @@
 
 solved backwards in time: one-sided derivatives by WENO, Lax-Friedrichs dissipation with max_u |f_i(x, u)| at each node,
 TVD Runge-Kutta under the CFL condition. Path constraints enter as the OCP's penalty (OCP.L_soft). V is right where
-optimal trajectories stay inside the box: beyond its edges V is taken to rise, so that leaving never pays.
+optimal trajectories stay inside the box: beyond its edges V is taken to rise, so that leaving never pays. Give the box
+a margin, and put the goal on a node: V's narrowest valleys end there.
 
 Sources: Osher and Shu, High-order essentially nonoscillatory schemes for Hamilton-Jacobi equations, SIAM J. Numer.
 Anal. 28 (1991); Jiang and Peng, Weighted ENO schemes for Hamilton-Jacobi equations, SIAM J. Sci. Comput. 21 (2000).
