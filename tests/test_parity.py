@@ -116,7 +116,7 @@ def test_samples_hold_the_corners_of_the_box():
 
 @pytest.mark.parametrize(("thing", "to", "message"), [
     (CONTROLLER, ("fortran",), "expected some of casadi, l4casadi, onnx, c"),
-    (3, ("casadi",), "got a int; expected a CND or LearnedDynamics"),
+    (3, ("casadi",), "got a int; expected a CND, LearnedDynamics or a list"),
 ])
 def test_refusals(tmp_path, thing, to, message):
     with pytest.raises(ValueError, match=message):
