@@ -184,7 +184,7 @@ def key_of(job: Judging) -> str:
     d = job.disturbance
     arrays = [part for run in job.runs for part in run.identity] + [a for kick in d.kicks for a in kick]
     return fingerprint(json.dumps(job.ocp.to_data(), sort_keys=True), job.x0, *arrays, list(job.delays), d.seed,
-                       "" if d.f is None else d.f.serialize(), "" if d.noise is None else d.noise, version("nocl"),
+                       "" if d.f is None else d.f, "" if d.noise is None else d.noise, version("nocl"),
                        version("casadi"))
 
 

@@ -46,7 +46,7 @@ class Run:
     def identity(self) -> Any:
         """What outcomes depend on; of a plain callable its name alone is known."""
         if isinstance(self.controller, ca.Function):
-            what: Any = self.controller.serialize()
+            what: Any = self.controller
         elif isinstance(self.controller, Loop):
             what = f"{self.controller.nmpc.key} {self.controller.receding}"
         elif isinstance(self.controller, np.ndarray):

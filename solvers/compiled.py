@@ -18,6 +18,7 @@ import numpy as np
 from nocl.kernels import CACHE_VARIABLE
 
 FLAGS = ("-O2", "-march=native", "-fPIC", "-shared")
+PLAIN = ("SXFunction", "MXFunction", "Map", "BSplineInterpolant", "LinearInterpolant")  # Functions that C has all of
 
 
 def folder_of(compiled: bool | str | os.PathLike[str]) -> str:
@@ -79,10 +80,23 @@ def _generate(solver: ca.Function, folder: str, name: str) -> None:
 
 
 def fingerprint(*parts: Any) -> str:
-    """A hash of bytes, strings, numbers and arrays."""
+    """A hash of bytes, strings, numbers, arrays and Functions."""
     total = hashlib.sha256()
     for part in parts:
+        part = _text(part) if isinstance(part, ca.Function) else part
         data = part if isinstance(part, bytes) else np.ascontiguousarray(part).tobytes() if isinstance(
             part, np.ndarray) else repr(part).encode()
         total.update(f"{len(data)}:".encode() + data)
     return total.hexdigest()[:32]
+
+
+def _text(function: ca.Function) -> str:
+    """What a Function is: its C, where C has all of it, else its serialisation.
+
+    A serialisation changes with use: a spline in it keeps its derivative once that was asked for.
+    """
+    if all(part.class_name() in PLAIN for part in (function, *function.find_functions())):
+        generator = ca.CodeGenerator("function")
+        generator.add(function)
+        return str(generator.dump())
+    return str(function.serialize())

@@ -109,10 +109,9 @@ class NMPC:
     @cached_property
     def key(self) -> str:
         """A fingerprint of the program: of the problem, models and settings that it is built from."""
-        functions = [None if g is None else g.serialize() for g in (self.dynamics, self.terminal)]
         options = sorted((self.options or {}).items())
-        return fingerprint(json.dumps(self.ocp.to_data(), sort_keys=True), *functions, int(self.intervals),
-                           int(self.substeps), self.constraints, self.solver, options)
+        return fingerprint(json.dumps(self.ocp.to_data(), sort_keys=True), self.dynamics, self.terminal,
+                           int(self.intervals), int(self.substeps), self.constraints, self.solver, options)
 
     @cached_property
     def program(self) -> Transcription:

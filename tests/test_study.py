@@ -18,6 +18,7 @@ from nocl.comparisons.region import grown, region
 from nocl.comparisons.robustness import Disturbances, mass_variants, on_plant, plant
 from nocl.comparisons.stability import local, stability
 from nocl.solvers import LQR, NMPC
+from nocl.solvers.compiled import fingerprint
 from nocl.systems import double_integrator, dubins
 
 
@@ -261,11 +262,24 @@ def test_a_variant_may_be_a_system_a_problem_or_a_function(ocp):
 
 def test_disturbances_resume_from_a_folder(ocp, tmp_path):
     x0, law = ocp.initial_states.sample(2, 1), {"LQR": LQR(ocp)}
-    first, again = (robustness(ocp, law, x0, mass_variants(ocp), Disturbances(hold=20), out=tmp_path, progress=False)
-                    for _ in range(2))
-    for a, b in zip(first.scenarios, again.scenarios, strict=True):
+    found, files = [], []
+    for _ in range(2):
+        found.append(robustness(ocp, law, x0, mass_variants(ocp), Disturbances(hold=20), out=tmp_path, progress=False))
+        files.append({file: file.stat().st_mtime_ns for file in tmp_path.rglob("*.npz")})
+    for a, b in zip(found[0].scenarios, found[1].scenarios, strict=True):
         np.testing.assert_array_equal(a.losses[0].cost, b.losses[0].cost)
-    assert list(tmp_path.iterdir())
+    assert len(files[0]) == 2 * len(found[0].scenarios)
+    assert files[0] == files[1]  # nothing was done twice
+
+
+def test_a_fingerprint_of_a_function_does_not_change_with_its_use():
+    t = ca.MX.sym("t")
+    first, other = (ca.Function("law", [t], [ca.bspline(t, [0, 1, end, 2], [[0, 0, 0, 0, 1, 1, 1, 1]], [3], 1, {})])
+                    for end in (1, 3))
+    before = fingerprint(first)
+    assert before != fingerprint(other)
+    first.jacobian()  # the spline keeps its derivative, and serialises with it
+    assert fingerprint(first) == before
 
 
 def test_losses_of_failures_and_of_unknown_optima():
