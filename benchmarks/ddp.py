@@ -6,6 +6,7 @@
 speed    problems a second of CPU time: DDP on a batch, NMPC and the others state by state (nmpc.py), all on one core;
          DDP on all cores by the clock
 share    solve_globally against the best known: DDP with 3 times the starts from another seed, and NMPC on a subset
+learned  200 tails in a tube, on the exact f and on a learned one (nocl.identify), one core, CPU time
 batch    cart-pole, cold from u*: 1 to 100,000 states, each size in a process of its own
 states   4 to 48 states: cart-poles side by side, their carts joined by springs, the goal held by feedback at first
 
@@ -31,15 +32,18 @@ import provenance
 import nocl
 from nocl import store
 from nocl.solvers import NMPC
+from nocl.solvers.bank import SolutionBank
+from nocl.solvers.cnd.labels import tube_states
 from nocl.solvers.ddp import DDP
 from nocl.solvers.global_search import solve_globally
 
 FIGURE = provenance.RESULTS.parents[1] / "docs" / "ddp_scaling.png"
-SECTIONS = ("speed", "share", "batch", "states")
+SECTIONS = ("speed", "share", "learned", "batch", "states")
 PROBLEMS = ("cartpole", "acrobot", "quadrotor", "dubins")
 BUNDLED = (*PROBLEMS, "pendulum", "van_der_pol", "double_integrator", "cartpole, wide box")
 SIZES = (1, 10, 100, 1000, 10_000, 100_000)
 POLES = (1, 2, 3, 6, 12)
+TAILS = 200  # of the section learned
 SAME = 1e-3  # relative: costs this close are the same optimum
 
 
@@ -78,7 +82,7 @@ def speed(args: argparse.Namespace, name: str) -> dict:
                              tools=("nocl fatrop", "nocl fatrop compiled", "nocl ipopt", *others.OTHERS),
                              others=args.others)
     data = others.problem_data(name, few.states, few.intervals, few.seed)
-    mine = DDP(ocp, intervals=args.intervals).solve(data["x0"])
+    mine = solve_globally(DDP(ocp, intervals=args.intervals), data["x0"], progress=False).best
     again = DDP(ocp, intervals=args.intervals).solve(data["warm"], u=mine.u, x=mine.x, gain=mine.gain)
     for tool, row in others.tools(few, name)["tools"].items():
         if "warm ms median" in row:
@@ -111,6 +115,22 @@ def share(args: argparse.Namespace, name: str) -> dict:
         ours.best.success.mean()), "reference's share": float(again.mean()), "NMPC better, of": [
         int(beaten.sum()), args.states], "starts a state": float(ours.starts.mean()), "seconds": seconds,
         "reference's cpu seconds": cpu, "optima a state": float(np.mean([len(o) for o in ours.optima]))}
+
+
+def learned(args: argparse.Namespace, name: str) -> dict:
+    """What tails on a learned f cost beside the same ones on the exact f."""
+    ocp, rng = problem(name), np.random.default_rng(args.seed)
+    exact = DDP(ocp, intervals=args.intervals, threads=1)
+    bank = SolutionBank.of(exact, solve_globally(exact, ocp.initial_states.sample(20, args.seed), progress=False).best)
+    rows, t0, x = tube_states(bank, TAILS, 0.2, ocp.horizon, rng)
+    guess = bank.guess(rows, t0)
+    result = {}
+    for what, model in (("exact", None), ("learned", nocl.identify(ocp.system, seed=args.seed, progress=False))):
+        ddp, built = timed(lambda m=model: DDP(ocp, intervals=args.intervals, dynamics=m, threads=1), 1)
+        found, seconds = timed(lambda d=ddp: d.solve(x, t0, **guess), 9, time.process_time)
+        result[what] = {"build s": built, "ms": 1e3 * seconds, "solved": float(found.success.mean()),
+                        "iterations": float(found.iterations.mean()), "mean cost": float(found.cost.mean())}
+    return result | {"tails": TAILS, "ratio": result["learned"]["ms"] / result["exact"]["ms"]}
 
 
 def poles(n: int) -> nocl.OCP:
@@ -207,7 +227,8 @@ def main() -> None:
             continue
         for name in args.problems:
             if section == "share" or name in PROBLEMS:
-                row = {"made": provenance.made(), **(share if section == "share" else speed)(args, name)}
+                run = {"share": share, "speed": speed, "learned": learned}[section]
+                row = {"made": provenance.made(), **run(args, name)}
                 print(f"  {name}: {json.dumps(row, indent=1)}", flush=True)
                 keep(section, {name: row})
 

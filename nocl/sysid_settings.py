@@ -25,7 +25,7 @@ class Budget:
     def of(variables: int) -> Budget:
         """What was enough for bundled systems: functions of one variable take seconds, of four about two minutes."""
         if variables <= 1:
-            return Budget(16, 500, 256, 60, 512)
+            return Budget(12, 500, 256, 60, 512)
         if variables <= 2:
             return Budget(24, 2000, 1024, 40, 1024)
         if variables <= 4:
