@@ -205,6 +205,8 @@ def solve(solver: Any, name: str, x0: Array, solving: Solving) -> list[tuple[Any
     given = {"workers": solving.workers, "out": out, "progress": solving.progress}
     takes = inspect.signature(solver.solve).parameters
     options = {key: value for key, value in given.items() if key in takes}
+    kept = out if "out" in takes else None
+    begun = kept is not None and kept.exists()
     start = time.perf_counter()
     try:
         solution = solver.solve(x0, **options)
@@ -213,7 +215,20 @@ def solve(solver: Any, name: str, x0: Array, solving: Solving) -> list[tuple[Any
             return [said(error)]
         alone = Solving(1, None, solving.progress)
         return [solve(solver, name, x[None], alone)[0] for x in x0]
-    return [(solution, (time.perf_counter() - start) / len(x0))]
+    return [(solution, _wall_time(time.perf_counter() - start, kept, begun) / len(x0))]
+
+
+def _wall_time(measured: float, kept: Path | None, begun: bool) -> float:
+    """Seconds that all solves took; of a run that was resumed those of the first one, NaN where it was cut off."""
+    if kept is None:
+        return measured
+    from nocl import store  # with torch
+
+    file = kept.with_name(f"{kept.name}.seconds")
+    if begun:
+        return float(file.read_text()) if file.exists() else float("nan")
+    store.write_bytes(file, repr(measured).encode())
+    return measured
 
 
 def planned(ocp: OCP, name: str, method: Any, parts: Sequence[tuple[Any, float] | str], B: int) -> Run:

@@ -120,21 +120,21 @@ def _optimum(report: Report) -> list[Stability]:
     found = found[found.success]
     if not len(found):
         return []
-    k, t = K // 2, ocp.horizon * MIDDLE
+    k, h = K // 2, ocp.horizon / K
     jacobians = [ocp.system.linearize(found.x[i, k], found.u[i, k]) for i in range(len(found))]
     A = np.array([A + B @ found.gain[i, k] for i, (A, B) in enumerate(jacobians)])
-    growth = np.array([np.linalg.norm(_transition(ocp, found.x[i, k:], found.u[i, k:], found.gain[i, k:]), 2)
+    growth = np.array([np.linalg.norm(_transition(ocp, found.x[i, k:], found.u[i, k:], found.gain[i, k:], h), 2)
                        for i in range(len(found))])
-    return [Stability(OPTIMUM, "mid-horizon", t, _eigenvalues(A), found.gain[:, k], growth)]
+    return [Stability(OPTIMUM, "mid-horizon", k * h, _eigenvalues(A), found.gain[:, k], growth)]
 
 
-def _transition(ocp: OCP, x: Array, u: Array, gain: Array) -> Array:
-    """The product of the closed loop's Jacobians over RK4 steps, [nx, nx]."""
-    s, K = ocp.system, len(u)
-    after = rk4(s.f, s.x, s.u, ocp.horizon * (1 - MIDDLE) / K)
+def _transition(ocp: OCP, x: Array, u: Array, gain: Array, h: float) -> Array:
+    """The product of the closed loop's Jacobians over RK4 steps of length h, [nx, nx]."""
+    s = ocp.system
+    after = rk4(s.f, s.x, s.u, h)
     step = ca.Function("step", [s.x, s.u], [ca.densify(ca.jacobian(after, s.x)), ca.densify(ca.jacobian(after, s.u))])
     Phi = np.eye(s.nx)
-    for k in range(K):
+    for k in range(len(u)):
         by_x, by_u = (j.full() for j in step(x[k], u[k]))
         Phi = (by_x + by_u @ gain[k]) @ Phi
     return Phi

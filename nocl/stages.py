@@ -24,6 +24,7 @@ from nocl import __version__, store
 from nocl.logs import Log
 from nocl.ocp import OCP
 from nocl.solvers.cnd import CND, TrainSettings, train
+from nocl.solvers.compiled import fingerprint
 from nocl.sysid import LearnedDynamics, LogSettings, Settings, identify
 
 QUICK_IDENTIFY = Settings(iterations=300, polish=10)
@@ -129,7 +130,8 @@ class Stages:
 
         chosen = {name: cnd if name == "CND" else method(self.ocp, name, intervals) for name in methods}
         model = self._dynamics_there() if cnd.card.get("dynamics") == "learned" else None
-        checkpoint = self._checkpoint(methods=list(methods), n=n, intervals=intervals, hold=str(hold), robust=robust)
+        checkpoint = self._checkpoint(methods=list(methods), n=n, intervals=intervals, hold=str(hold), robust=robust,
+                                      controller=fingerprint(cnd.to_casadi()))
         say(f"comparing {', '.join(methods)} on {n} initial states, on the exact dynamics")
         report = study(self.ocp, chosen, n=n, seed=fresh_seed(self.seed), hold=hold, model=model, robust=robust,
                        variants=mass_variants(self.ocp) if robust else None, out=checkpoint)

@@ -115,8 +115,10 @@ class GlobalDDP:
     starts: int = 16
     seed: int = 0
 
-    def solve(self, x0: ArrayLike) -> DDPSolution:
-        return solve_globally(self.ddp, x0, starts=self.starts, seed=self.seed).best
+    def solve(self, x0: ArrayLike, workers: int | str = "auto", out: str | os.PathLike[str] | None = None,
+              progress: bool | None = None) -> DDPSolution:
+        return solve_globally(self.ddp, x0, starts=self.starts, seed=self.seed, workers=workers, out=out,
+                              progress=progress).best
 
 
 class _Search:

@@ -1,6 +1,7 @@
 """compare: gaps to a known optimum, a row for every method and state, the same states for all, no lost failure."""
 
 import dataclasses
+import shutil
 
 import casadi as ca
 import numpy as np
@@ -288,6 +289,21 @@ def test_a_comparison_resumes_where_it_was_interrupted(ocp, tmp_path):
         np.testing.assert_array_equal(a.ms_first, b.ms_first)
     with pytest.raises(ValueError, match="another run"):
         compare(ocp, methods, n=4, hold=20, out=tmp_path, progress=False)
+
+
+def test_times_of_a_resumed_solver_are_those_of_its_first_run(ocp, tmp_path):
+    """DDP says no seconds of its own, and pieces that were kept take none."""
+    methods = {"DDP": DDP(ocp, intervals=10)}
+    first, again = (compare(ocp, methods, n=3, out=tmp_path / "whole", progress=False).judged[0] for _ in range(2))
+    assert np.isfinite(first.ms_first).all()
+    shutil.rmtree(tmp_path / "whole" / "judged")
+    fresh = compare(ocp, methods, n=3, out=tmp_path / "whole", progress=False).judged[0]
+    np.testing.assert_array_equal(first.ms_first, again.ms_first)
+    np.testing.assert_array_equal(first.ms_first, fresh.ms_first)
+    (tmp_path / "whole" / "solves" / "DDP.seconds").unlink()
+    shutil.rmtree(tmp_path / "whole" / "judged")
+    cut = compare(ocp, methods, n=3, out=tmp_path / "whole", progress=False).judged[0]
+    assert np.isnan(cut.ms_first).all()
 
 
 def test_casadi_functions_are_methods(ocp):

@@ -24,6 +24,7 @@ from nocl.comparisons.report import VIOLATION
 from nocl.integrate import rk4
 from nocl.ocp import OCP
 from nocl.simulate import Simulation, simulate
+from nocl.solvers.compiled import fingerprint
 from nocl.systems import load_ocp
 
 TOLERANCE = 0.1
@@ -191,11 +192,11 @@ def _level_sets(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Mad
     return solution, rollout_ms(ocp, solution, x0), f"{grid} nodes, {solution.seconds:.0f} s"
 
 
-def _pretrained(dynamics: str) -> Callable[..., Made]:
+def _pretrained(way: str) -> Callable[..., Made]:
     def made(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
         from nocl.solvers.cnd import pretrained
 
-        cnd = pretrained("dubins", dynamics)
+        cnd = pretrained("dubins", SHIPPED[way])
         return cnd, rollout_ms(ocp, cnd, x0), "as it ships with nocl"
 
     return made
@@ -225,9 +226,10 @@ WAYS = {"rrt-100": Way("RRT* (iter: 100)", _rrt(100), (4.8871, 0.9607, 6.9313, 0
         "rrt-200": Way("RRT* (iter: 200)", _rrt(200), (4.7343, 0.8451, 26.0595, 0.939)),
         "nmpc": Way("NMPC", _nmpc), "level-sets": Way("HJB level sets", _level_sets),
         "cnd-paper": Way("CND, the paper's method", _paper, (4.1076, 0.6916, 0.0634, 0.999)),
-        "cnd": Way("CND, nocl's default, exact f", _pretrained("exact")),
-        "cnd-learned": Way("CND, nocl's default, learned f", _pretrained("learned")),
+        "cnd": Way("CND, nocl's default, exact f", _pretrained("cnd")),
+        "cnd-learned": Way("CND, nocl's default, learned f", _pretrained("cnd-learned")),
         "optimum": Way("multi-start optimum", _optimum)}
+SHIPPED = {"cnd": "exact", "cnd-learned": "learned"}  # way -> dynamics
 NEEDS = {"rrt-100": "ompl", "rrt-200": "ompl", "level-sets": "hj_reachability"}
 PLANS = {False: Plan(), True: Plan(n=20, grid=(24, 37, 41), paper_iterations=20, quick=True)}
 
@@ -238,6 +240,10 @@ def _key(way: str, plan: Plan) -> dict[str, Any]:
         key["grid"] = list(plan.grid)
     if way == "cnd-paper":
         key["iterations"] = plan.paper_iterations
+    if way in SHIPPED:
+        from nocl.solvers.cnd import pretrained
+
+        key["controller"] = fingerprint(pretrained("dubins", SHIPPED[way]).to_casadi())
     return key
 
 
