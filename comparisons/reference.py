@@ -43,7 +43,8 @@ class Reference:
 
 
 def resolved(ocp: OCP, start: DDPSolution, kicks: Sequence[tuple[int, Array]]) -> Array:
-    """Cost [B] of the optimum that is solved anew after each kick (slot, dx [B, nx]), from the unkicked optimum.
+    """Cost [B] of the optimum that is solved anew after each kick (slot, dx [B, nx]), from the unkicked optimum;
+    inf where a solve failed.
 
     Slots rise; slot k is the time k T / SLOTS. The intervals of `start` are a multiple of SLOTS.
     """
@@ -51,11 +52,14 @@ def resolved(ocp: OCP, start: DDPSolution, kicks: Sequence[tuple[int, Array]]) -
     if K % SLOTS:
         raise ValueError(f"the optimum has {K} intervals; expected a multiple of {SLOTS}, where kicks fall")
     solution, cost, now, per_slot = start, np.zeros(len(start)), 0, K // SLOTS
+    found = np.array(start.success, dtype=bool)
     for slot, dx in kicks:
         node = (slot - now) * per_slot
-        cost += solution.V[:, 0] - solution.V[:, node]
-        x, u = solution.x[:, node] + dx, np.ascontiguousarray(solution.u[:, node:])
+        cost[found] += solution.V[found, 0] - solution.V[found, node]
+        x = np.where(found[:, None], solution.x[:, node] + dx, ocp.x_goal)  # what is lost may have blown up
+        u = np.ascontiguousarray(solution.u[:, node:])
         states, gain = np.ascontiguousarray(solution.x[:, node:]), np.ascontiguousarray(solution.gain[:, node:])
         ddp, t0 = DDP(ocp, intervals=K - slot * per_slot), slot * ocp.horizon / SLOTS
         solution, now = better(ddp.solve(x, t0, u=u, x=states, gain=gain), ddp.solve(x, t0, u=u)), slot
-    return cost + solution.cost
+        found &= solution.success
+    return np.where(found, cost + solution.cost, np.inf)

@@ -46,7 +46,7 @@ class Disturbances:
     kicks: int = 5  # in a run, at random times
     hold: int = 80  # intervals that all feedback is held on under noise, held and late
     late: float = 0.5  # delay, as a share of such an interval
-    weaker: float = 0.2  # share that controls lack where the model is wrong
+    weaker: float = 0.2  # share of u - u* that is lacking where the model is wrong
     fastest: int = 200  # samples over the horizon that a loop which could be faster is run at in real time
     seed: int = 12345
 

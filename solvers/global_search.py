@@ -90,7 +90,7 @@ def solve_globally(ddp: DDP, x0: ArrayLike, *, starts: int = 16, neighbours: int
     if min(starts + (known is not None), neighbours + 1, rounds + 1) < 1:
         raise ValueError(f"starts is {starts}, neighbours {neighbours}, rounds {rounds}; expected starts >= 1 (0 where "
                          "solutions are known), the others >= 0")
-    search = _Search(ddp, rows, seed, known, workers, out, progress, report)
+    search = _Search(ddp, rows, seed, known, (starts, neighbours, rounds), workers, out, progress, report)
     for start in range(starts):
         search.stage(f"cold start {start + 1} of {starts}", search.cold, np.arange(len(rows)), start)
     for round_ in range(rounds):
@@ -124,8 +124,8 @@ class GlobalDDP:
 class _Search:
     """The best of all that was tried from each state, and the costs at which each start ended."""
 
-    def __init__(self, ddp: DDP, x0: Array, seed: Seed, known: DDPSolution | None, workers: int | str,
-                 out: str | os.PathLike[str] | None, progress: bool | None, report: Report) -> None:
+    def __init__(self, ddp: DDP, x0: Array, seed: Seed, known: DDPSolution | None, plan: tuple[int, int, int],
+                 workers: int | str, out: str | os.PathLike[str] | None, progress: bool | None, report: Report) -> None:
         self.ddp, self.x0, self.workers, self.report = ddp, x0, workers, report
         self.show = sys.stderr.isatty() if progress is None else progress
         self.seed = int(np.random.default_rng(seed).integers(2**62))
@@ -134,7 +134,7 @@ class _Search:
         self.stages = self.done = 0
         self.improving = True  # whether the last stage found anything
         self.folder = None if out is None else Path(out)
-        self.key = fingerprint(ddp.key, x0, self.seed, *([] if known is None else [known.u])) if out else ""
+        self.key = fingerprint(ddp.key, x0, self.seed, plan, *([] if known is None else [known.u])) if out else ""
         self.best = _nothing(ddp, x0)
         if known is not None:
             self._merge(np.arange(len(x0)), known)
@@ -306,8 +306,8 @@ class _Search:
 
         state, meta = store.load_checkpoint(self.folder / CHECKPOINT)
         if meta.get("key") != self.key:
-            raise ValueError(f"{self.folder} holds another search (other states, problem, settings or seed); expected "
-                             "the same one, or a new folder: change `out`")
+            raise ValueError(f"{self.folder} holds another search (other states, problem, settings, starts or seed); "
+                             "expected the same one, or a new folder: change `out`")
         self.best = DDPSolution.of_arrays({**state["best"], "message": np.array(state["message"], dtype=MESSAGE)})
         self.near, self.owners, self.costs = state["near"], [state["owners"]], [state["costs"]]
         self.done, self.was_improving = meta["stages"], meta["improving"]

@@ -153,6 +153,8 @@ def test_an_interrupted_search_goes_on_where_it_was(tmp_path, monkeypatch):
     assert [p.name for p in (tmp_path / "s").iterdir()] == ["search.safetensors"]
     with pytest.raises(ValueError, match="another search"):
         solve_globally(cartpole(), x0[:3], **options, out=tmp_path / "s")
+    with pytest.raises(ValueError, match="another search"):
+        solve_globally(cartpole(), x0, **options | {"starts": 6}, out=tmp_path / "s")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").write_text("mine")
     with pytest.raises(ValueError, match="not empty"):

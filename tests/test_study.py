@@ -206,6 +206,16 @@ def test_the_resolved_optimum_of_a_linear_problem(ocp):
         resolved(ocp, Reference(ocp, 30).solve(x0), [])
 
 
+def test_a_state_without_an_optimum_does_not_stop_the_others(ocp):
+    start = Reference(ocp, 40).solve(ocp.initial_states.sample(2, 7))
+    kicks = [(10, np.full((2, 2), 0.1))]
+    whole = resolved(ocp, start, kicks)
+    for values in (start.x, start.V, start.u):
+        values[1] = np.nan
+    start.cost[1], start.success[1] = np.inf, False
+    np.testing.assert_array_equal(resolved(ocp, start, kicks), [whole[0], np.inf])
+
+
 @pytest.fixture(scope="module")
 def robust(ocp):
     loop = NMPC(ocp, intervals=10, starts=1, passes=0)
