@@ -100,7 +100,7 @@ class _Stage:
         self.nets = [_Net(mlp, p, z, i) for i, (mlp, p) in enumerate(nets)]
         self.networks = ca.vertcat(*(ca.vec(n.symbols) for n in self.nets))
         self.bend = ca.vertcat(*(n.bend for n in self.nets))
-        xdot: Any = ocp.system.xdot if net is None else net.outputs(x, u, *(n.y for n in self.nets))
+        xdot: Any = ocp.system.equations if net is None else net.outputs(x, u, *(n.y for n in self.nets))
         self.rhs = ca.vertcat(xdot, ocp.L_soft(x, u))
         y, yz = ca.vertcat(*(n.y for n in self.nets)), ca.vertcat(*(n.slopes for n in self.nets))
         self.J, scalar = ca.jacobian(self.rhs, z), ca.dot(self.mu, self.rhs)

@@ -215,6 +215,10 @@ def test_an_unknown_plant_says_so(model):
         model.score()
     with pytest.raises(ValueError, match="equations of 'oscillator' are not known"):
         _ = model.system.f
+    ocp = nocl.load_ocp("double_integrator")
+    unknown = dataclasses.replace(ocp, system=dataclasses.replace(ocp.system, xdot=None))
+    with pytest.raises(ValueError, match="equations of 'double_integrator' are not known"):
+        DDP(unknown)
     assert "equations not known" in repr(model.system)
 
 

@@ -21,6 +21,7 @@ from tqdm import tqdm
 
 from nocl import store
 from nocl.comparisons.reproduce.dubins import rollout_ms
+from nocl.solvers.compiled import fingerprint
 from nocl.systems import load_ocp
 
 PROBLEMS = ("double_integrator", "pendulum", "dubins", "cartpole", "acrobot", "quadrotor")
@@ -64,7 +65,7 @@ class Cell:
     ms: float  # a state's whole control trajectory
     covers: str
     note: str
-    key: dict[str, int]
+    key: dict[str, Any]
 
 
 def run(out: str | Path, plan: Plan | None = None, *, progress: bool = True) -> list[Cell]:
@@ -79,15 +80,19 @@ def run(out: str | Path, plan: Plan | None = None, *, progress: bool = True) -> 
             bar.set_postfix_str(f"{problem}, {WAYS[way]}")
             path = folder / CELLS / f"approaches-{problem}-{way}.json"
             cell = _read(path) if path.is_file() else None
-            if cell is None or cell.key != _key(way, plan):
+            if cell is None or cell.key != _key(way, plan, problem):
                 cell = MAKERS[way](problem, plan)
                 store.write_json(path, asdict(cell))
             cells.append(cell)
     return cells
 
 
-def _key(way: str, plan: Plan) -> dict[str, int]:
-    return {"level-sets": {"nodes": plan.nodes}, "nmpc": {"states": plan.states}}.get(way, {})
+def _key(way: str, plan: Plan, problem: str) -> dict[str, Any]:
+    """What a cell is made with; of CND the controller that comes with nocl, too."""
+    key: dict[str, Any] = {"nodes": plan.nodes} if way == "level-sets" else {"states": plan.states}
+    if way == "cnd" and (cnd := _shipped(problem)) is not None:
+        key["controller"] = fingerprint(cnd.to_casadi())
+    return key
 
 
 def _read(path: Path) -> Cell:
@@ -103,7 +108,7 @@ def _level_sets(problem: str, plan: Plan) -> Cell:
     from nocl.solvers.levelset import LevelSet
 
     ocp, nan = load_ocp(problem), float("nan")
-    nx, covers, key = ocp.system.nx, "V(x, t) on the whole box", _key("level-sets", plan)
+    nx, covers, key = ocp.system.nx, "V(x, t) on the whole box", _key("level-sets", plan, problem)
     size = f"{float(plan.nodes) ** nx:.3g} nodes"
     if nx > 4:
         at_least = float(plan.nodes) ** nx * 8 / 1e6  # one array of doubles
@@ -133,22 +138,28 @@ def _nmpc(problem: str, plan: Plan) -> Cell:
     unknowns = solver.intervals * (ocp.system.nx + ocp.system.nu) + ocp.system.nx
     return Cell(problem, ocp.system.nx, "nmpc", f"{unknowns} unknowns", float("nan"), built,
                 float(1e3 * np.median(solution.seconds)), "one initial state, a local optimum", "one start a state",
-                _key("nmpc", plan))
+                _key("nmpc", plan, problem))
 
 
 def _cnd(problem: str, plan: Plan) -> Cell:
-    from nocl.solvers.cnd import pretrained
-
-    ocp, nan = load_ocp(problem), float("nan")
+    ocp, nan, cnd, key = load_ocp(problem), float("nan"), _shipped(problem), _key("cnd", plan, problem)
     covers = "the initial states that it was trained for"
-    try:
-        cnd = pretrained(problem, "exact")
-    except ValueError:
-        return Cell(problem, ocp.system.nx, "cnd", "", nan, nan, nan, covers, "none ships with nocl", {})
+    if cnd is None:
+        return Cell(problem, ocp.system.nx, "cnd", "", nan, nan, nan, covers, "none ships with nocl", key)
     weights = sum(p.numel() for net in (cnd.policy, cnd.value_net) if net is not None for p in net.parameters())
     return Cell(problem, ocp.system.nx, "cnd", f"{weights} weights", weights * 8 / 1e6, _training_seconds(cnd),
                 rollout_ms(ocp, cnd, ocp.initial_states.sample(plan.states, 1)), covers,
-                "its training's time as its card has it", {})
+                "its training's time as its card has it", key)
+
+
+def _shipped(problem: str) -> Any:
+    """The controller that comes with nocl, or None."""
+    from nocl.solvers.cnd import pretrained
+
+    try:
+        return pretrained(problem, "exact")
+    except ValueError:
+        return None
 
 
 def _training_seconds(cnd: Any) -> float:
