@@ -89,14 +89,16 @@ def train_paper(ocp: OCP, dynamics: Any = None, settings: PaperSettings | None =
     seed : of initial networks and initial states; the caller's own generators are left alone
     progress : a bar with the loss terms and the time left; None: where the terminal is one
     callback : called as callback(iteration, terms) after each iteration of the joint training
-    checkpoint : a file that is written at each of 40 checks; the same call goes on from it, to the same result
+    checkpoint : a file that is written at each of 40 checks; the same call goes on from it, to the same result; plain
+        callables are known by name
 
     The card holds settings, seed, seconds, evaluations of the dynamics, the race and the terms' history: data only.
     Raises ValueError where training diverges, naming the iteration and what to try.
     """
     settings = settings or PaperSettings()
     trainer = _Trainer(ocp, dynamics, settings, seed, progress, device, dtype)
-    key = identity(ocp, settings, seed, trainer.f, dtype=str(dtype), dynamics=str(type(dynamics)))
+    named = f"{type(dynamics)}{getattr(dynamics, '__qualname__', '')}"  # of a plain callable its name alone is known
+    key = identity(ocp, settings, seed, trainer.f, dtype=str(dtype), dynamics=named)
     run = _Run.resumed(trainer, checkpoint, key) or _Run.raced(trainer)
     run.train(callback, None if checkpoint is None else lambda: run.save(checkpoint, key))
     policy, value = run.best.networks(settings)
