@@ -40,7 +40,7 @@ def compared(problem: str, n: int, seed: int, robust: bool, workers: int | str) 
 
 
 def lqr(ocp: nocl.OCP) -> dict[str, Any]:
-    """LQR where the goal is an equilibrium that it can hold, as at dubins's it is not."""
+    """LQR where the goal pair is an equilibrium; at dubins's, a car that stands, its linear model cannot steer."""
     try:
         law = solvers.LQR(ocp)
         law.P(0.0)

@@ -308,3 +308,17 @@ def test_a_study_fills_the_report(ocp, tmp_path):
     assert [p.method for p in report.promises] == ["LQR", "NMPC"]
     assert report.robustness is None
     assert "with 99 % confidence" in str(report)
+
+
+@pytest.mark.slow
+def test_a_robust_study_in_one_go(ocp, tmp_path):
+    methods = {"LQR": LQR(ocp), "NMPC": NMPC(ocp, intervals=10, starts=1, passes=0)}
+    report = study(ocp, methods, n=2, robust=True, disturbances=Disturbances(hold=10, fastest=10), workers=1,
+                   progress=False)
+    assert report.robustness is not None
+    assert [loss.method for loss in report.robustness.scenarios[0].losses] == ["LQR", "NMPC", "NMPC closed loop"]
+    assert [r.method for r in report.regions] == ["LQR"]
+    assert "cost lost %" in str(report)
+    page = report.save(tmp_path).read_text()
+    assert "id=robustness" in page
+    assert "id=regions" in page
