@@ -29,6 +29,7 @@ from pathlib import Path
 
 import casadi as ca
 import numpy as np
+import provenance
 
 ROOT = Path(__file__).resolve().parents[1]
 PROBLEMS = ("cartpole", "acrobot", "quadrotor", "dubins")
@@ -370,7 +371,7 @@ def environment() -> dict:
     cpu = next((line.split(":")[1].strip() for line in Path("/proc/cpuinfo").read_text().splitlines()
                 if line.startswith("model name")), platform.processor())
     packages = ("nocl", "casadi", "numpy", "joblib")
-    return {"command": " ".join(["python", *sys.argv]), "commit": git("rev-parse", "HEAD"),
+    return {"command": provenance.command(), "commit": git("rev-parse", "HEAD"),
             "changed files": git("status", "--short").splitlines(), "python": platform.python_version(), "cpu": cpu,
             "cores": os.cpu_count(), "load": os.getloadavg(), "when": time.strftime("%Y-%m-%d %H:%M:%S %z"),
             "versions": {p: importlib.metadata.version(p) for p in packages}}

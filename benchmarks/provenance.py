@@ -27,7 +27,13 @@ def write(name: str, rows: Any, **more: Any) -> Path:
 def made() -> dict[str, Any]:
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False,
                             cwd=Path(__file__).parent).stdout.strip()
-    return {"command": shlex.join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]]), "commit": commit,
+    return {"command": command(), "commit": commit,
             "date": datetime.now(UTC).strftime("%Y-%m-%d"),
             "versions": {p: version(p) for p in ("nocl", "casadi", "torch", "numpy", "scipy")},
             "machine": f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"}
+
+
+def command() -> str:
+    """The command line, without the folders of this machine."""
+    words = [Path(word).name if os.path.isabs(word) else word for word in sys.argv[1:]]
+    return shlex.join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *words])

@@ -14,7 +14,7 @@ from nocl.checks import Array
 from nocl.kernels import emit
 from nocl.ocp import OCP
 
-STRAIGHT = 20_000  # products in the chain rule through a step, up to which it is straight-line code
+STRAIGHT = 5_000  # products in the chain rule through a step, up to which it is straight-line code
 ACTIVATION_KINDS = {"sine": 0, "tanh": 1, "relu": 2, "silu": 3}  # as csrc/mlp.h numbers them
 Columns = list[ca.SX]
 _STEP = """#define NZ (N + M)
