@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from nocl.checks import Array
 
+COST_FLOOR = 1e-8  # gaps are relative to max(|best cost|, this): costs below it are the judge's rounding
 LEVELS = (5, 25, 50, 75, 95)  # percentiles that distributions are summed up by
 Row = dict[str, Any]
 
@@ -106,7 +107,7 @@ class Loss:
     def lost(self) -> Array:
         """[B], 100 (cost - best) / |best|; inf where it failed, NaN where no optimum is known."""
         with np.errstate(invalid="ignore"):
-            lost = 100 * (self.cost - self.best) / np.maximum(np.abs(self.best), 1e-8)
+            lost = 100 * (self.cost - self.best) / np.maximum(np.abs(self.best), COST_FLOOR)
         return np.where(np.isfinite(self.best), np.where(self.success, lost, np.inf), np.nan)
 
     def summary(self) -> Row:

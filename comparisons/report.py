@@ -16,11 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nocl.checks import Array
-from nocl.comparisons.findings import MethodAudit, Promise, Region, Robustness, Row, Stability, percentile
+from nocl.comparisons.findings import (
+    COST_FLOOR,
+    MethodAudit,
+    Promise,
+    Region,
+    Robustness,
+    Row,
+    Stability,
+    percentile,
+)
 from nocl.ocp import OCP
 from nocl.simulate import Simulation
 
-COST_FLOOR = 1e-8  # gaps are relative to max(|best cost|, this): costs below it are the judge's rounding
 REFERENCE = "reference"  # the name of a yardstick among the methods: its speed is no method's
 VIOLATION = 1e-3  # a path constraint below minus this, in its own unit, is violated
 OPEN_LOOP = "open loop"  # how a plan's control was run

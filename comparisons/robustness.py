@@ -89,6 +89,17 @@ def on_plant(ocp: OCP, f: ca.Function) -> OCP:
     return replace(ocp, system=replace(s, xdot=f(s.x, s.u)))
 
 
+def _spread(value: Any, nx: int, name: str) -> Array:
+    """A standard deviation for each state [nx], from a number or nx of them >= 0; ValueError for others."""
+    try:
+        sigma = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        sigma = np.full(1, np.nan)
+    if sigma.shape not in ((), (nx,)) or not (np.isfinite(sigma) & (sigma >= 0)).all():
+        raise ValueError(f"Disturbances: {name} is {value!r}; expected a number >= 0, or {nx} of them, one a state")
+    return np.broadcast_to(sigma, (nx,)).copy()
+
+
 class _Study:
     """One call of robustness."""
 
@@ -101,8 +112,7 @@ class _Study:
         self.held = [run if run.solved is not None else replace(
             run, hold=rate, how=how(rate), controller=at_rate(run.controller, rate)) for run in self.runs]
         nx, rng = ocp.system.nx, np.random.default_rng(settings.seed)
-        self.noise = np.broadcast_to(np.asarray(settings.noise, dtype=np.float64), (nx,)).copy()
-        sigma = np.broadcast_to(np.asarray(settings.kick, dtype=np.float64), (nx,))
+        self.noise, sigma = (_spread(getattr(settings, name), nx, name) for name in ("noise", "kick"))
         slots = np.sort(rng.choice(np.arange(1, SLOTS - 1), settings.kicks, replace=False))
         self.kicks = [(int(slot), sigma * rng.standard_normal(x0.shape)) for slot in slots]
 

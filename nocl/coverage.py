@@ -18,6 +18,7 @@ from nocl.logs import Log
 from nocl.system import System
 
 POINTS = 2000  # of the log that are kept
+LEAST = 1e-9  # radius, where recordings repeat each other
 USUAL = 0.95  # share of a recording's states that lie within `radius` of the other recordings
 
 
@@ -53,7 +54,7 @@ class Coverage:
         points, label = whole.features(x[order]), label[order]
         apart = [KDTree(points[label != k]).query(points[label == k])[0] for k in np.unique(label)]
         return Coverage(points, whole.centre, whole.scale, whole.angles,
-                        float(np.quantile(np.concatenate(apart), USUAL)), whole.names)
+                        max(float(np.quantile(np.concatenate(apart), USUAL)), LEAST), whole.names)
 
     def features(self, x: Array) -> Array:
         """States [N, nx] as points [N, d]."""

@@ -322,3 +322,9 @@ def test_a_robust_study_in_one_go(ocp, tmp_path):
     page = report.save(tmp_path).read_text()
     assert "id=robustness" in page
     assert "id=regions" in page
+
+
+@pytest.mark.parametrize("wrong", [{"noise": [0.1] * 3}, {"kick": -0.1}, {"noise": "loud"}])
+def test_disturbances_that_make_no_sense_are_refused(ocp, wrong):
+    with pytest.raises(ValueError, match=f"Disturbances: {next(iter(wrong))} is .*; expected a number >= 0, or 2"):
+        robustness(ocp, {"LQR": LQR(ocp)}, ocp.initial_states.sample(1, 0), settings=Disturbances(**wrong))
