@@ -63,6 +63,7 @@ class Session:
         runtime = package("onnxruntime")
         options = runtime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
+        options.log_severity_level = 3  # errors: that a constant is not needed is no news
         self.session = runtime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         self.names = [i.name for i in self.session.get_inputs()]
         self.dtype = np.float64 if "double" in self.session.get_inputs()[0].type else np.float32
