@@ -2,14 +2,13 @@
 
 import json
 import pickle
-import time
 from functools import lru_cache
 
 import casadi as ca
 import numpy as np
 import pytest
 from test_ddp import BUNDLED, problem, random_model, scalar_problem, solver
-from test_nmpc_pool import start
+from test_nmpc_pool import dask_cluster
 
 import nocl
 from nocl.solvers import NMPC, ddp_batch
@@ -101,26 +100,10 @@ def test_bad_workers(workers):
 
 @pytest.mark.slow
 def test_a_dask_cluster_gives_the_same(tmp_path, monkeypatch):
-    distributed = pytest.importorskip("distributed")
     ddp, x0 = pendulum()
     monkeypatch.setattr(ddp_batch, "MOST", 8)
-    contact, processes = tmp_path / "scheduler.json", []
-    processes.append(start("distributed.cli.dask_scheduler", "--port", "0", "--host", "127.0.0.1", "--no-dashboard",
-                           "--scheduler-file", str(contact)))
-    try:
-        deadline = time.monotonic() + 60
-        while not contact.exists() and time.monotonic() < deadline:
-            time.sleep(0.2)
-        address = json.loads(contact.read_text())["address"]
-        processes += [start("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard",
-                            "--local-directory", str(tmp_path / f"worker{i}")) for i in range(2)]
-        with distributed.Client(address, set_as_default=False) as client:
-            client.wait_for_workers(2, timeout=90)
+    with dask_cluster(tmp_path) as (address, _):
         solution = ddp.solve(x0, workers=address, out=tmp_path / "run")
-    finally:
-        for process in processes[::-1]:
-            process.terminate()
-            process.wait(30)
     assert_same(solution, ddp.solve(x0))
 
 

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -141,25 +142,35 @@ def start(*command):
                             stderr=subprocess.DEVNULL)
 
 
-@pytest.mark.slow
-def test_a_dask_worker_killed_in_the_middle_loses_nothing(tmp_path, monkeypatch):
-    """A real scheduler and two worker processes; one is killed after a few outcomes have come in."""
+@contextmanager
+def dask_cluster(folder):
+    """A real scheduler and two worker processes: (address, [scheduler, worker, worker])."""
     distributed = pytest.importorskip("distributed")
-    nmpc, x0 = NMPC(nocl.load_ocp("cartpole"), 40, starts=6, passes=2), None
-    x0 = nmpc.ocp.initial_states.sample(48, 0)
-    contact, processes, written = tmp_path / "scheduler.json", [], []
-    processes.append(start("distributed.cli.dask_scheduler", "--port", "0", "--host", "127.0.0.1", "--no-dashboard",
-                           "--scheduler-file", str(contact)))
+    contact = folder / "scheduler.json"
+    processes = [start("distributed.cli.dask_scheduler", "--port", "0", "--host", "127.0.0.1", "--no-dashboard",
+                       "--scheduler-file", str(contact))]
     try:
         deadline = time.monotonic() + 60
         while not contact.exists() and time.monotonic() < deadline:
             time.sleep(0.2)
         address = json.loads(contact.read_text())["address"]
         processes += [start("distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny", "--no-dashboard",
-                            "--local-directory", str(tmp_path / f"worker{i}")) for i in range(2)]
+                            "--local-directory", str(folder / f"worker{i}")) for i in range(2)]
         with distributed.Client(address, set_as_default=False) as client:
             client.wait_for_workers(2, timeout=90)
-        write = Journal.write
+        yield address, processes
+    finally:
+        for process in processes[::-1]:
+            process.terminate()
+            process.wait(30)
+
+
+@pytest.mark.slow
+def test_a_dask_worker_killed_in_the_middle_loses_nothing(tmp_path, monkeypatch):
+    """One of two is killed after a few outcomes have come in."""
+    nmpc = NMPC(nocl.load_ocp("cartpole"), 40, starts=6, passes=2)
+    x0, written, write = nmpc.ocp.initial_states.sample(48, 0), [], Journal.write
+    with dask_cluster(tmp_path) as (address, processes):
 
         def killing(self, outcome):
             write(self, outcome)
@@ -170,10 +181,6 @@ def test_a_dask_worker_killed_in_the_middle_loses_nothing(tmp_path, monkeypatch)
         monkeypatch.setattr(Journal, "write", killing)
         solution = nmpc.solve(x0, workers=address, out=tmp_path / "run")
         assert processes[1].wait(10) == -signal.SIGKILL
-    finally:
-        for process in processes[::-1]:
-            process.terminate()
-            process.wait(30)
     assert len(written) == len(set(written))
     assert {f"start-{i:06d}" for i in range(48)} <= set(written)
     assert_same(solution, nmpc.solve(x0, workers=1))
