@@ -13,6 +13,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.metadata import version
@@ -34,6 +35,7 @@ from nocl.solvers.pool import Journal, Pool, stream
 if TYPE_CHECKING:
     from nocl.sysid import LearnedDynamics
 
+STAGES = 4  # evaluations of f in an RK4 step
 GROWTH, DECAY = 4.0, 2.0  # of mu, after a failure and a success: against 8 and 8, twice as many wild starts converge
 
 
@@ -83,6 +85,7 @@ class DDP:
         self.ocp, self.intervals, self.settings = ocp, int(intervals), settings or DDPSettings()
         self.threads = int(threads or os.cpu_count() or 1)
         self.dynamics, self.cache = dynamics, cache
+        self.evaluations: Counter[str] = Counter()  # of f in this process, one for each state: "rollout", "backward"
         net = None if dynamics is None else _fitting(ocp, dynamics)
         self._weights = np.zeros(1) if net is None else pack_weights(net)
         self._kernel = ddp_kernel(ocp, dynamics, cache)
@@ -221,12 +224,14 @@ class _Work:
 
     def _rollout(self, rows: Rows, x_bar: Array, u_bar: Array, gain: Array) -> None:
         d = self.ddp
+        d.evaluations["rollout"] += STAGES * d.intervals * len(rows)
         d._kernel("nocl_rollout", rows, d.intervals, d._weights, d._lb, d._ub, self.h, self.x0, x_bar, u_bar, self.k,
                   gain, self.alpha, self.new_x, self.new_u, self.new_J, threads=d.threads)
 
     def _backward(self, rows: Rows, V: Array | None = None, V_x: Array | None = None,
                   V_xx: Array | None = None) -> None:
         d = self.ddp
+        d.evaluations["backward"] += STAGES * d.intervals * len(rows)  # with first and second derivatives
         d._kernel("nocl_backward", rows, d.intervals, d._weights, d._lb, d._ub, self.h, self.x, self.u, self.mu, self.k,
                   self.gain, self.slope, self.curve, self.positive, V, V_x, V_xx, threads=d.threads)
 

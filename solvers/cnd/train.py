@@ -127,7 +127,7 @@ class _Training:
         self.fine = DDP(ocp, intervals=4 * settings.intervals, dynamics=dynamics)
         self.checkpoint = None if out is None else Path(out) / CHECKPOINT
         self.hidden_progress = None if progress is None else not progress
-        self.round, self.seconds = 0, 0.0
+        self.round, self.seconds, self.evaluations = 0, 0.0, 0
         self.history: list[dict[str, Any]] = []
         self.losses: list[float] = []
         self.value_card: dict[str, Any] = {}
@@ -255,7 +255,12 @@ class _Training:
         last = self.history[-1]
         return {"method": "default", "dynamics": "learned" if self.learned else "exact", "seed": self.seed,
                 "gap_median": last["gap_median"], "gap_p95": last["gap_p95"], "seconds": round(self.seconds, 1),
+                "dynamics_evaluations": self._evaluations(),
                 "settings": asdict(self.settings), "history": self.history, "value": self.value_card}
+
+    def _evaluations(self) -> int:
+        """Of f, in rollouts of DDP, one for each state; those before a checkpoint included."""
+        return self.evaluations + sum(ddp.evaluations["rollout"] for ddp in (self.ddp, self.fine))
 
     @contextmanager
     def _stage(self, name: str, total: int) -> Iterator[tqdm[Any]]:
@@ -276,7 +281,7 @@ class _Training:
         state = {"policy": self.net.state_dict(), "labels": _tensors(vars(self.labels)),
                  "bank": _tensors({k: v for k, v in vars(self.bank.solution).items() if k != "message"})}
         meta = {"identity": self._identity(), "round": self.round, "history": self.history, "seconds": self.seconds,
-                "first": self.first}
+                "first": self.first, "evaluations": self._evaluations()}
         self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
         store.save_checkpoint(self.checkpoint, state, meta)
 
@@ -290,6 +295,7 @@ class _Training:
         self.labels = Labels(**_arrays(state["labels"]))
         self.bank = SolutionBank.from_arrays(self.ddp, _arrays(state["bank"]))
         self.round, self.history, self.seconds, self.first = (meta[k] for k in ("round", "history", "seconds", "first"))
+        self.evaluations = meta.get("evaluations", 0)
         self._network()
         self.net.double().load_state_dict(state["policy"])
         self.net.eval().requires_grad_(False)
