@@ -196,9 +196,10 @@ def test_the_papers_run_is_drawn_too(whole, tmp_path):
 def test_a_large_gap_is_told_with_what_to_try():
     with pytest.warns(UserWarning, match=r"costs .* % more than the optimum .* try TrainSettings with more rounds"):
         nocl.train(nocl.load_ocp("double_integrator"), settings=replace(TINY, rounds=0, value=False), progress=False)
-    near = {"gap_median": 1e-4, "gap_p95": 1e-3}
-    assert advice(near, 2) is None
-    assert "more seeds" in advice({**near, "gap_p95": 0.5}, 2)
+    near = {"gap_median": 1e-4, "gap_p95": 1e-3, "unsolved": 0}
+    assert advice(near, 2, 64) is None
+    assert "more seeds" in advice({**near, "gap_p95": 0.5}, 2, 64)
+    assert "7 of 64" in advice({**near, "unsolved": 7}, 2, 64)
 
 
 def test_the_gap_counts_from_any_time_and_a_policy_that_blows_up_is_infinitely_bad(pendulum):

@@ -148,7 +148,7 @@ class _Training:
             self._validate()
             self.round += 1
             self._save()
-        if (remark := advice(self.history[-1], self.round - 1)) is not None:
+        if (remark := advice(self.history[-1], self.round - 1, s.held_out)) is not None:
             warnings.warn(f"{self.ocp.system.name}: {remark}", stacklevel=4)
         value = self._value() if s.value else None
         return CND(self.ocp, self.net, value, self._card())
@@ -213,6 +213,7 @@ class _Training:
             self.starts = held_out_optima(*solvers, x0)
             self.tails = kicked_optima(*solvers, self.policy, self.f, 4 * s.held_out, s.kick, rng)
             row = {"round": self.round, "labels": len(self.labels), "loss": self.losses,
+                   "unsolved": s.held_out - len(self.starts),
                    **summary(gap(self.ocp, self.policy, self.f, self.starts), "gap"),
                    **summary(gap(self.ocp, self.policy, self.f, self.tails, self._unit()), "kicked")}
             if s.control_dt:

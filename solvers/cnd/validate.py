@@ -98,8 +98,11 @@ def _hjb(ocp: OCP, value: FeatureNet, policy: torch.nn.Module, f: Field, tails: 
     return {"hjb_median": float(np.median(residual)) / usual, "hjb_mean": float(residual.mean()) / usual}
 
 
-def advice(row: dict[str, Any], rounds: int) -> str | None:
-    """What to say, and to try, where the last round's gap is large; None where it is not."""
+def advice(row: dict[str, Any], rounds: int, held_out: int) -> str | None:
+    """What to say, and to try, where the last round's gap is large or few states tell it; None where it is well."""
+    if row["unsolved"] > 0.1 * held_out:
+        return (f"{row['unsolved']} of {held_out} held-out initial states could not be solved, and the gap is that of the "
+                "others: try TrainSettings with more seeds and starts, or more intervals where the dynamics are fast")
     if row["gap_median"] <= 0.01 and row["gap_p95"] <= 0.2:
         return None
     tries = ("more rounds or visits, wider layers (hidden=(128, 128, 128)) or more iterations"
