@@ -1,4 +1,4 @@
-"""RK4 steps of the exact f, fused: the step and its vector-Jacobian product as generated C, one autograd node each.
+"""RK4 steps of the exact f, or any function, fused: it and its vector-Jacobian product as C, one autograd node each.
 
 Eager torch walks some hundred small operations a step, forth and back; this is two calls, to rounding the same.
 """
@@ -95,6 +95,69 @@ class _Step(torch.autograd.Function):
         out = torch.from_numpy(step.run("nocl_step_vjp", step.nx + step.nu, ctx.h, *ctx.rows, _rows(bar))).to(bar.dtype)
         shape = bar.shape[:-1]
         return out[:, : step.nx].reshape(*shape, -1), out[:, step.nx:].reshape(*shape, -1), None, None
+
+
+_FUNCTION = """
+void nocl_function(int64_t first, int64_t last, const int64_t *index, const double *in_, double *out_)
+{
+    for (int64_t b = first; b < last; ++b) {
+        const int64_t *at = index + b * WIDTH;
+        lane in[N], out[M];
+        for (int i = 0; i < N; ++i) in[i] = gather(in_, at, N, i);
+        function(in, out);
+        for (int i = 0; i < M; ++i) scatter(out_, at, M, i, out[i]);
+    }
+}
+
+void nocl_function_vjp(int64_t first, int64_t last, const int64_t *index, const double *in_, const double *bar_,
+                       double *out_)
+{
+    for (int64_t b = first; b < last; ++b) {
+        const int64_t *at = index + b * WIDTH;
+        lane in[N], bar[M], out[N];
+        for (int i = 0; i < N; ++i) in[i] = gather(in_, at, N, i);
+        for (int i = 0; i < M; ++i) bar[i] = gather(bar_, at, M, i);
+        function_vjp(in, bar, out);
+        for (int i = 0; i < N; ++i) scatter(out_, at, N, i, out[i]);
+    }
+}
+"""
+
+
+class FusedFunction:
+    """A casadi.Function z -> y on torch rows z [B, n], as C: what `to_torch` gives, to rounding, in two calls.
+
+    On the CPU, any float dtype, float64 inside. Differentiable once. Errors as those of FusedStep.
+    """
+
+    def __init__(self, function: ca.Function) -> None:
+        z, self.m = ca.SX.sym("z", function.numel_in(0)), function.numel_out(0)
+        y, bar = ca.densify(function(z)), ca.SX.sym("bar", self.m)
+        vjp = ca.densify(ca.jtimes(y, z, bar, True))
+        head = f'#include "lanes.h"\n#define N {z.numel()}\n#define M {self.m}\n'
+        self._kernel = Kernel(head + emit("function", [z], [y]) + emit("function_vjp", [z, bar], [vjp]) + _FUNCTION)
+
+    def __call__(self, z: Tensor) -> Tensor:
+        return _Function.apply(z, self)
+
+    def run(self, name: str, width: int, *rows: Array) -> Tensor:
+        """Kernel `name` on rows [B, ...] -> [B, width]."""
+        out = np.empty((len(rows[0]), width))
+        self._kernel(name, np.arange(len(out)), *rows, out)
+        return torch.from_numpy(out)
+
+
+class _Function(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, z: Tensor, function: FusedFunction) -> Tensor:
+        ctx.rows, ctx.function = _rows(z), function
+        return function.run("nocl_function", function.m, ctx.rows).to(z.dtype)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, bar: Tensor) -> tuple[Tensor | None, ...]:
+        rows = ctx.rows
+        return ctx.function.run("nocl_function_vjp", rows.shape[1], rows, _rows(bar)).to(bar.dtype), None
 
 
 def _rows(z: Tensor) -> Array:

@@ -6,7 +6,8 @@ from importlib import import_module
 from typing import Any
 
 _LAZY = {"LQR": "nocl.solvers.lqr", "NMPC": "nocl.solvers.nmpc", "DDP": "nocl.solvers.ddp", "CND": "nocl.solvers.cnd",
-         "SolutionBank": "nocl.solvers.bank", "solve_globally": "nocl.solvers.global_search"}
+         "SolutionBank": "nocl.solvers.bank", "solve_globally": "nocl.solvers.global_search",
+         "NeuralOC": "nocl.solvers.neural_oc", "train_neural_oc": "nocl.solvers.neural_oc"}
 __all__ = list(_LAZY)
 
 

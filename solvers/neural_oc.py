@@ -1,0 +1,401 @@
+"""NeuralOC: the value function as a network, u its Hamiltonian's minimiser, trained through rollouts of the exact f.
+
+    V(x, t) / scale = w'N(s) + s'(A'A)s / 2 + b's + c,   s = (x, t),
+    N(s) = r_M,   r_0 = sigma(K_0 s + k_0),   r_i = r_{i-1} + sigma(K_i r_{i-1} + k_i) / M,   sigma' = tanh,
+    u(x, t) = argmin over U of L(x, u) + V_x'f(x, u),
+
+    loss = mean of int_0^T L dt + G(x(T)) + c_HJt int_0^T |V_t + H(x, V_x)| dt
+                   + c_HJfin |V(x(T), T) - G(x(T))| + c_HJgrad ||V_x(x(T), T) - G_x(x(T))||_1.
+
+Onken, Nurbekyan, Li, Wu Fung, Osher, Ruthotto, "A Neural Network Approach for High-Dimensional Optimal Control",
+arXiv 2104.03270; settings: their published code. As everywhere in nocl V_t + min_u (L + V_x'f) = 0 and V(x, T) = G(x).
+Departures: u comes from the problem's own symbols (`nocl.hamiltonian`), with the box U; the weight of G is the
+problem's; and `scale`, half the mean curvature of L in u, is theirs only where L = ||u||^2 + ..., as in their problems:
+with it a fresh network's controls are of order one whatever the units of the cost.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import os
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor, nn
+from tqdm import tqdm
+
+from nocl import checks, store
+from nocl.checks import Array
+from nocl.fused import FusedFunction
+from nocl.hamiltonian import minimiser
+from nocl.integrate import rk4
+from nocl.ocp import OCP
+from nocl.threads import one_thread
+from nocl.to_torch import to_torch
+
+__all__ = ["NeuralOC", "NeuralOCSettings", "train_neural_oc"]
+FILE = "neural_oc.safetensors"
+TERMS = ("running", "terminal", "hjb", "final", "gradient")  # of the loss, each without its weight
+
+
+@dataclass(frozen=True)
+class NeuralOCSettings:
+    """Settings of `train_neural_oc`; the defaults are those published for the quadcopter."""
+
+    width: int = 128  # of the ResNet
+    layers: int = 2  # of the ResNet: the opening one, and residual ones
+    rank: int = 10  # rows of A, at most nx + 1 of them
+    steps: int = 26  # of RK4 in a rollout
+    iterations: int = 6000  # of Adam
+    batch: int = 1024  # initial states, and as many held-out ones
+    learning_rate: float = 0.01
+    drop: float = 0.5  # factor of the learning rate ...
+    drop_every: int = 1200  # ... after so many iterations, which then go on from the best network so far
+    resample_every: int = 25  # iterations on the same initial states
+    check_every: int = 50  # iterations between looks at the held-out states; the best network is kept
+    weights: tuple[float, float, float] = (0.1, 0.0, 0.0)  # c_HJt, c_HJfin, c_HJgrad
+    fused: bool = True  # f, L, H and their gradients as compiled C; False: in torch, the same to rounding
+
+    def __post_init__(self) -> None:
+        least = dict.fromkeys(("width", "rank", "steps", "iterations", "batch", "drop_every", "resample_every",
+                               "check_every"), 1) | {"layers": 2}
+        for name, n in least.items():
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < n:
+                raise ValueError(f"NeuralOCSettings: {name} is {value!r}; expected an integer >= {n}")
+        for name in ("learning_rate", "drop"):
+            value = getattr(self, name)
+            if not _is_number(value) or value <= 0 or (name == "drop" and value > 1):
+                raise ValueError(f"NeuralOCSettings: {name} is {value!r}; expected a number > 0"
+                                 + (", at most 1, which is no drop" if name == "drop" else ""))
+        weights: Any = tuple(self.weights) if isinstance(self.weights, (tuple, list)) else (self.weights,)
+        if len(weights) != 3 or not all(_is_number(w) and w >= 0 for w in weights):
+            raise ValueError(f"NeuralOCSettings: weights is {weights}; expected three numbers >= 0, c_HJt, c_HJfin, "
+                             "c_HJgrad: published for the quadcopter are (0.1, 0, 0)")
+        object.__setattr__(self, "weights", weights)
+        if not isinstance(self.fused, bool):
+            raise ValueError(f"NeuralOCSettings: fused is {self.fused!r}; expected True or False")
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+
+
+class ValueNet(nn.Module):
+    """V(x, t) [B, 1] of rows x [B, nx], t [B, 1], and its gradient in closed form. Weights: torch's seed."""
+
+    def __init__(self, nx: int, width: int, layers: int, rank: int, scale: float) -> None:
+        super().__init__()
+        n, self.scale = nx + 1, scale
+        self.opening = nn.Linear(n, width)
+        self.residual = nn.ModuleList([nn.Linear(width, width) for _ in range(layers - 1)])
+        self.w = nn.Parameter(torch.ones(width))
+        self.A = nn.Parameter(nn.init.xavier_uniform_(torch.empty(min(rank, n), n)))
+        self.b, self.c = nn.Parameter(torch.zeros(n)), nn.Parameter(torch.zeros(()))
+
+    def forward(self, x: Tensor, t: Tensor) -> Tensor:
+        s = torch.cat([x, t], -1)
+        r, _ = self._sweep(s)
+        V = r @ self.w + (s @ self.A.T).square().sum(-1) / 2 + s @ self.b + self.c
+        return self.scale * V[..., None]
+
+    def gradient(self, x: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+        """(V_x [B, nx], V_t [B, 1]), differentiable once more."""
+        s = torch.cat([x, t], -1)
+        _, slopes = self._sweep(s)
+        z: Tensor = self.w
+        for K, slope in zip(reversed(self._residual_weights()), reversed(slopes[1:]), strict=True):
+            z = z + (slope * z) @ K / len(self.residual)
+        g = self.scale * ((slopes[0] * z) @ self.opening.weight + (s @ self.A.T) @ self.A + self.b)
+        return g[..., :-1], g[..., -1:]
+
+    def _sweep(self, s: Tensor) -> tuple[Tensor, list[Tensor]]:
+        """N(s) and tanh of each layer's argument, the slopes of sigma."""
+        r, slope = _Sigma.apply(self.opening(s))
+        slopes = [slope]
+        for layer in self.residual:
+            value, slope = _Sigma.apply(layer(r))
+            r = r + value / len(self.residual)
+            slopes.append(slope)
+        return r, slopes
+
+    def to_casadi(self) -> tuple[ca.Function, ca.Function]:
+        """(value:(x, t) -> V, value_gradient:(x, t) -> V_x), native MX."""
+        weights = {name: ca.DM(p.detach().double().numpy()) for name, p in self.named_parameters()}
+        W = [weights[f"{name}.weight"] for name in self._layer_names()]
+        x, t = ca.MX.sym("x", W[0].size2() - 1), ca.MX.sym("t")
+        s, A = ca.vertcat(x, t), weights["A"]
+        a = [ca.mtimes(W[0], s) + weights["opening.bias"]]
+        r, share = _sigma_mx(a[0]), 1 / len(self.residual)
+        for name, K in zip(self._layer_names()[1:], W[1:], strict=True):
+            a.append(ca.mtimes(K, r) + weights[f"{name}.bias"])
+            r = r + share * _sigma_mx(a[-1])
+        As, z = ca.mtimes(A, s), ca.MX(weights["w"])
+        V = ca.dot(weights["w"], r) + ca.sumsqr(As) / 2 + ca.dot(weights["b"], s) + weights["c"]
+        for K, a_i in zip(reversed(W[1:]), reversed(a[1:]), strict=True):
+            z = z + share * ca.mtimes(K.T, ca.tanh(a_i) * z)
+        g = ca.mtimes(W[0].T, ca.tanh(a[0]) * z) + ca.mtimes(A.T, As) + weights["b"]
+        return (ca.Function("value", [x, t], [self.scale * V], ["x", "t"], ["V"]),
+                ca.Function("value_gradient", [x, t], [self.scale * g[:-1]], ["x", "t"], ["V_x"]))
+
+    def _layer_names(self) -> list[str]:
+        return ["opening", *(f"residual.{i}" for i in range(len(self.residual)))]
+
+    def _residual_weights(self) -> list[Tensor]:
+        return [p for name, p in self.residual.named_parameters() if name.endswith("weight")]
+
+    def sizes(self) -> dict[str, Any]:
+        """What it was constructed with."""
+        return {"nx": self.opening.in_features - 1, "width": self.opening.out_features,
+                "layers": 1 + len(self.residual), "rank": len(self.A), "scale": self.scale}
+
+
+class _Sigma(torch.autograd.Function):
+    """(log(e^a + e^-a), tanh(a)), sharing one exponential."""
+
+    @staticmethod
+    def forward(ctx: Any, a: Tensor) -> tuple[Tensor, Tensor]:
+        size = a.abs()
+        e = (-2 * size).exp_()
+        slope = torch.copysign((1 - e) / (1 + e), a)
+        ctx.save_for_backward(slope)
+        return size + e.add_(1).log_(), slope
+
+    @staticmethod
+    def backward(ctx: Any, bar: Tensor, bar_slope: Tensor) -> Tensor:
+        (slope,) = ctx.saved_tensors
+        return bar * slope + bar_slope * (1 - slope * slope)
+
+
+def _sigma_mx(a: ca.MX) -> ca.MX:
+    return ca.fabs(a) + ca.log1p(ca.exp(-2 * ca.fabs(a)))
+
+
+class NeuralOC:
+    """A feedback controller u(x, t) that minimises the Hamiltonian of its value function; made by `train_neural_oc`.
+
+    Attributes
+    ----------
+    ocp, value_net : the problem, and V as a torch module in float64
+    card : settings, seed, seconds, nfe (evaluations of the dynamics in its rollouts, one for each state and control),
+        held_out (the loss of the network that was kept), history of the loss terms: plain JSON data
+    """
+
+    def __init__(self, ocp: OCP, value_net: ValueNet, card: Mapping[str, Any] | None = None) -> None:
+        self.ocp, self.card = ocp, dict(card or {})
+        self.value_net = value_net.double().eval().requires_grad_(False)
+        self._minimiser = _minimiser(ocp)
+        self._u = to_torch(self._minimiser)
+
+    def __call__(self, x: ArrayLike, t: ArrayLike = 0.0) -> Array:
+        """u [nu] at a state [nx], or [B, nu] at [B, nx], and a time (one for all, or [B])."""
+        rows, times, single = self._tensors(x, t)
+        u: Array = self._u(rows, self.value_net.gradient(rows, times)[0]).numpy()
+        return u[0] if single else u
+
+    def value(self, x: ArrayLike, t: ArrayLike = 0.0) -> Array:
+        """V(x, t), the cost-to-go: a number at [nx], or [B] at [B, nx]."""
+        rows, times, single = self._tensors(x, t)
+        V: Array = self.value_net(rows, times).numpy()[:, 0]
+        return V[0] if single else V
+
+    def value_gradient(self, x: ArrayLike, t: ArrayLike = 0.0) -> Array:
+        """V_x, the costate: [nx] at [nx], or [B, nx] at [B, nx]."""
+        rows, times, single = self._tensors(x, t)
+        V_x: Array = self.value_net.gradient(rows, times)[0].numpy()
+        return V_x[0] if single else V_x
+
+    def to_casadi(self) -> ca.Function:
+        """policy:(x [nx], t) -> (u [nu]), native MX."""
+        x, t = ca.MX.sym("x", self.ocp.system.nx), ca.MX.sym("t")
+        u = self._minimiser(x, self.value_net.to_casadi()[1](x, t))
+        return ca.Function("policy", [x, t], [ca.densify(u)], ["x", "t"], ["u"])
+
+    def value_to_casadi(self) -> ca.Function:
+        """value:(x [nx], t) -> (V), native MX."""
+        return self.value_net.to_casadi()[0]
+
+    def save(self, folder: str | os.PathLike[str]) -> Path:
+        """Write network, problem and card as one data-only file in `folder`, all or nothing."""
+        meta = {"solver": "neural_oc", "net": self.value_net.sizes(), "ocp": self.ocp.to_data(), "card": self.card}
+        return store.save_checkpoint(Path(folder) / FILE, self.value_net.state_dict(), meta)
+
+    @classmethod
+    def load(cls, folder: str | os.PathLike[str]) -> NeuralOC:
+        """What `save` wrote; raises ValueError for a missing, damaged or foreign file."""
+        path = Path(folder) / FILE
+        state, meta = store.load_checkpoint(path)
+        if meta.get("solver") != "neural_oc":
+            raise ValueError(f"{path} was not written by NeuralOC.save; expected a controller: name its folder")
+        net = ValueNet(**meta["net"]).double()
+        net.load_state_dict(state)
+        return cls(OCP.from_data(meta["ocp"]), net, meta["card"])
+
+    def __repr__(self) -> str:
+        facts = ", ".join(f"{k} {v:.4g}" for k, v in self.card.items() if isinstance(v, (int, float)))
+        return f"NeuralOC on {self.ocp.system.name!r}: {facts or 'no card'}"
+
+    def _tensors(self, x: ArrayLike, t: ArrayLike) -> tuple[Tensor, Tensor, bool]:
+        rows, single = checks.states(x, self.ocp.system.nx, self.ocp.system.name, "x")
+        times = np.asarray(t, dtype=np.float64)
+        if times.shape not in ((), (len(rows),)) or not ((times >= 0) & (times <= self.ocp.horizon * (1 + 1e-9))).all():
+            raise ValueError(f"t is {np.array2string(times, threshold=4)}; expected one time or {len(rows)}, "
+                             f"each in [0, {self.ocp.horizon:g}]")
+        times = np.broadcast_to(times, len(rows)).copy()[:, None]
+        return torch.from_numpy(rows.copy()), torch.from_numpy(times), single
+
+
+def train_neural_oc(ocp: OCP, settings: NeuralOCSettings | None = None, *, dynamics: None = None, seed: int = 0,
+                    progress: bool | None = True) -> NeuralOC:
+    """V(x, t) and its feedback for an OCP, on the exact f, in float32 on one core.
+
+    Parameters
+    ----------
+    dynamics : None, the exact f: the method is published for known dynamics
+    seed : of the initial network and the initial states; the caller's own generators are left alone
+    progress : a bar with the terms of the loss and the time left; None: where the terminal is one
+
+    Path constraints enter as the OCP's penalty (OCP.L_soft). Nothing is written to disk. Raises ValueError for other
+    dynamics; where H has no minimiser in closed form, or L is not strictly convex in u (u jumps then, and nothing is
+    learned through it); and where training diverges, naming the iteration and what to try.
+    """
+    checks.problem(ocp, "train_neural_oc")
+    if dynamics is not None:
+        raise ValueError(f"train_neural_oc: dynamics is a {type(dynamics).__name__}; expected None: NeuralOC knows the "
+                         "exact f, in closed form; for learned dynamics use nocl.train(ocp, dynamics=...)")
+    settings = settings or NeuralOCSettings()
+    with one_thread():
+        start = time.perf_counter()
+        trainer = _Trainer(ocp, settings, seed)
+        trainer.train(progress)
+        seconds = time.perf_counter() - start
+    net = trainer.net.double()
+    net.load_state_dict(trainer.best)
+    card = {"method": "NeuralOC", "settings": asdict(settings) | {"weights": list(settings.weights)}, "seed": seed,
+            "seconds": seconds, "nfe": trainer.nfe, "held_out": trainer.lowest,
+            "best_iteration": trainer.best_iteration,
+            "history": {name: [row[i] for row in trainer.rows] for i, name in enumerate(TERMS)}}
+    return NeuralOC(ocp, net, card)
+
+
+class _Trainer:
+    """One training: the problem in torch, its network and random numbers, the best network so far."""
+
+    def __init__(self, ocp: OCP, settings: NeuralOCSettings, seed: int, dtype: torch.dtype = torch.float32) -> None:
+        self.ocp, self.settings, self.dtype = ocp, settings, dtype
+        field, self.final = _characteristics(ocp), to_torch(_terminal(ocp))
+        self.field = FusedFunction(field) if settings.fused else to_torch(field)
+        self.rng = np.random.default_rng(seed)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(int(self.rng.integers(2**31)))
+            self.net = ValueNet(ocp.system.nx, settings.width, settings.layers, settings.rank, _scale(ocp)).to(dtype)
+        self.nfe, self.rows = 0, list[list[float]]()  # rows: the terms of each iteration
+        self.held_out = self.states()
+        self.best, self.lowest, self.best_iteration = copy.deepcopy(self.net.state_dict()), math.inf, 0
+
+    def states(self) -> Tensor:
+        """Fresh initial states [batch, nx]."""
+        return torch.as_tensor(self.ocp.initial_states.sample(self.settings.batch, self.rng), dtype=self.dtype)
+
+    def terms(self, x0: Tensor) -> Tensor:
+        """The five terms [5] on rollouts from x0 [B, nx], each a mean."""
+        nx, K, T = self.ocp.system.nx, self.settings.steps, self.ocp.horizon
+
+        def rate(z: Tensor, _: None) -> Tensor:  # z = (x, t, integral of L, integral of the HJB residual)
+            V_x, V_t = self.net.gradient(z[:, :nx], z[:, nx: nx + 1])
+            y = self.field(torch.cat([z[:, :nx], V_x], 1))
+            return torch.cat([y[:, :nx], torch.ones_like(V_t), y[:, nx: nx + 1], (V_t + y[:, nx + 1:]).abs()], 1)
+
+        z = nn.functional.pad(x0, (0, 3))
+        for _ in range(K):
+            z = rk4(rate, z, None, T / K)
+        self.nfe += 4 * K * len(x0)
+        x, t = z[:, :nx], torch.full_like(z[:, :1], T)
+        G = self.final(x)
+        V, V_x = self.net(x, t), self.net.gradient(x, t)[0]
+        return torch.stack([z[:, nx + 1].mean(), G[:, 0].mean(), z[:, nx + 2].mean(), (V - G[:, :1]).abs().mean(),
+                            (V_x - G[:, 1:]).abs().sum(1).mean()])
+
+    def loss(self, terms: Tensor) -> Tensor:
+        return terms @ torch.tensor([1.0, 1.0, *self.settings.weights], dtype=self.dtype)
+
+    def train(self, progress: bool | None) -> None:
+        s = self.settings
+        adam = torch.optim.Adam(self.net.parameters(), lr=s.learning_rate)
+        hidden = None if progress is None else not progress
+        x0 = self.states()
+        for k in (bar := tqdm(range(1, s.iterations + 1), f"NeuralOC on {self.ocp.system.name}", disable=hidden)):
+            terms = self.terms(x0)
+            adam.zero_grad()
+            self.loss(terms).backward()
+            self.rows.append(terms.tolist())
+            self.check_finite()
+            adam.step()
+            bar.set_postfix({n: f"{v:.3g}" for n, v in zip(TERMS, self.rows[-1], strict=True)}, refresh=False)
+            if k % s.check_every == 0 or k == s.iterations:
+                self.look(k)
+            if k % s.drop_every == 0:
+                self.net.load_state_dict(self.best)
+                adam.param_groups[0]["lr"] *= s.drop
+            if k % s.resample_every == 0:
+                x0 = self.states()
+
+    def look(self, iteration: int) -> None:
+        """The loss on held-out states; the best network is kept."""
+        with torch.no_grad():
+            loss = float(self.loss(self.terms(self.held_out)))
+        if loss < self.lowest:
+            self.best, self.lowest, self.best_iteration = copy.deepcopy(self.net.state_dict()), loss, iteration
+
+    def check_finite(self) -> None:
+        gradients = [p.grad.sum() for p in self.net.parameters() if p.grad is not None]
+        if not all(map(math.isfinite, self.rows[-1])) or not torch.isfinite(torch.stack(gradients)).all():
+            shown = ", ".join(f"{n} {v:.3g}" for n, v in zip(TERMS, self.rows[-1], strict=True))
+            raise ValueError(f"training diverged at iteration {len(self.rows)}: NaN or infinite losses or gradients "
+                             f"({shown}); expected finite ones: try a smaller learning_rate (is "
+                             f"{self.settings.learning_rate:g}), more steps (are {self.settings.steps}), or a shorter "
+                             "horizon, narrower initial_states, tighter control bounds")
+
+
+def _minimiser(ocp: OCP) -> ca.Function:
+    """(x, p) -> u*(x, p), in SX."""
+    function = minimiser(ocp)
+    if function is None:
+        raise ValueError(f"NeuralOC of {ocp.system.name!r}: its Hamiltonian L + p'f has no minimiser in closed form; "
+                         "expected one quadratic in u that couples at most 4 controls: use nocl.train or NMPC")
+    x, p = ocp.system.x, ca.SX.sym("p", ocp.system.nx)
+    return ca.Function("u", [x, p], [function(x, p)[0]], ["x", "p"], ["u"])
+
+
+def _characteristics(ocp: OCP) -> ca.Function:
+    """(x, p) in one vector -> (f, L, H) at u*(x, p)."""
+    s, p = ocp.system, ca.SX.sym("p", ocp.system.nx)
+    u = _minimiser(ocp)(s.x, p)
+    f, L = s.f(s.x, u), ocp.L_soft(s.x, u)
+    return ca.Function("characteristics", [ca.vertcat(s.x, p)], [ca.vertcat(f, L, L + ca.dot(p, f))])
+
+
+def _terminal(ocp: OCP) -> ca.Function:
+    """x -> (G, G_x)."""
+    x, G = ocp.system.x, ocp.terminal
+    return ca.Function("terminal", [x], [ca.densify(ca.vertcat(G, ca.gradient(G, x)))])
+
+
+def _scale(ocp: OCP) -> float:
+    """Half the mean curvature of L in u at the goal: the weight of ||u||^2."""
+    s = ocp.system
+    H, _ = ca.hessian(ocp.running, s.u)
+    curvature = np.linalg.eigvalsh(ca.Function("H", [s.x, s.u], [ca.densify(H)])(ocp.x_goal, ocp.u_goal).full())
+    if curvature.min() <= 0:
+        raise ValueError(f"NeuralOC of {s.name!r}: the Hessian of L in u has the eigenvalues {curvature.tolist()} at "
+                         "the goal; expected > 0, or u* jumps and nothing is learned through it: add a cost on each "
+                         "control, or use nocl.train")
+    return float(curvature.mean() / 2)
