@@ -133,8 +133,20 @@ def _add_tables(sub: argparse.ArgumentParser) -> None:
                      help="of Adam in the paper's method; default: 1000, with --quick 20")
     one.add_argument("--grid", type=_grid, metavar="A,B,C", help="nodes of the level sets; default: 46,73,81")
     one.add_argument("--ways", type=_words, metavar="A,B", help="rows, like rrt-100,cnd; default: all eight")
+    _add_control(table("gym", _reproduce_control, "acrobot and cart-pole by learned dynamics: CND, NMPC"))
+    _add_control(table("quadrotor", _reproduce_control, "the quadrotor, f known and not: CND, NeuralOC, NMPC, LQR"))
     one = table("approaches", _reproduce_approaches, "which approach gives what: time and memory by number of states")
     one.add_argument("--problems", type=_words, metavar="A,B", help="default: six, of 2 to 12 states")
+
+
+def _add_control(one: argparse.ArgumentParser) -> None:
+    one.set_defaults(table=one.prog.split()[-1])
+    one.add_argument("--seeds", type=_count, metavar="K",
+                     help="of controllers, learned dynamics and initial states; default: 3, with --quick 1")
+    one.add_argument("--n", type=_count, help="initial states of each seed; default: 1000, with --quick 8")
+    one.add_argument("--iterations", type=_count, metavar="N",
+                     help="of Adam in the paper's method; default: 600, with --quick 10")
+    one.add_argument("--ways", type=_words, metavar="A,B", help="rows, like cnd,nmpc; default: all that can be run")
 
 
 def _add(sub: argparse.ArgumentParser, *names: str) -> None:
@@ -248,6 +260,20 @@ def _reproduce_dubins(args: argparse.Namespace) -> None:
     cells = dubins.finished(args.out)
     paths = dubins_tables.write(args.out, cells)
     print(dubins_tables.markdown(dubins.table(cells)), end="")
+    print("written:", ", ".join(map(str, paths)))
+
+
+def _reproduce_control(args: argparse.Namespace) -> None:
+    from nocl.comparisons.reproduce import control, control_tables
+
+    given = {"n": args.n, "seeds": args.seeds, "iterations": args.iterations, "ways": args.ways}
+    chosen = {name: value for name, value in given.items() if value is not None}
+    plan = control.Plan(args.table, quick=args.quick, **((control.QUICK if args.quick else {}) | chosen))
+    _check_out(args.out)
+    control.run(args.out, plan)
+    cells = control.finished(args.out, plan.table)
+    paths = control_tables.write(args.out, cells, plan.table)
+    print(control_tables.markdown(control.table(cells, plan.table), plan.table), end="")
     print("written:", ", ".join(map(str, paths)))
 
 
