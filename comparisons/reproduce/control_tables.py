@@ -118,6 +118,7 @@ def figure(entries: Sequence[Entry], name: str) -> Figure:
     """Terminal error of each way, logarithmic, a panel for each problem: dots ours (bars: the seeds), rings theirs."""
     import matplotlib
     from matplotlib.figure import Figure
+    from matplotlib.ticker import LogLocator, NullFormatter
 
     from nocl.comparisons.style import COLOURS, STYLE
 
@@ -130,6 +131,9 @@ def figure(entries: Sequence[Entry], name: str) -> Figure:
         for problem, axes in zip(problems, panels, strict=True):
             _dots(axes, {e.way: e for e in entries if e.problem == problem}, t.ways, problem)
             axes.set(xscale="log", title=problem, xlabel="terminal error")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+            axes.xaxis.set_major_formatter("{x:g}")
+            axes.xaxis.set_minor_formatter(NullFormatter())
         panels[0].set_yticks(range(len(labels)), labels)
         panels[0].invert_yaxis()
         handles = [axes.plot([], [], "o", ms=4, color=COLOURS[0])[0],
@@ -174,6 +178,7 @@ def flights(cells: Sequence[Cell], name: str) -> Figure:
                 inside = np.where(((path >= low) & (path <= high)).all(1, keepdims=True), path, np.nan)
                 axes.plot(*inside.T, color=COLOURS[0], lw=0.9)
                 axes.plot(*path[:1].T, ".", color=COLOURS[0], ms=3)
+            axes.set_box_aspect(None, zoom=0.85)
             axes.plot(*goal[:, None], "+", color=COLOURS[1], ms=9)
             axes.set(title=f"{ways[cell.way].title}, {_dynamics(ways[cell.way])}", xlim=(low[0], high[0]),
                      ylim=(low[1], high[1]), zlim=(low[2], high[2]), xlabel="x", ylabel="y", zlabel="z")
