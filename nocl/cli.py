@@ -145,7 +145,7 @@ def _add_control(one: argparse.ArgumentParser) -> None:
                      help="of controllers, learned dynamics and initial states; default: 3, with --quick 1")
     one.add_argument("--n", type=_count, help="initial states of each seed; default: 1000, with --quick 8")
     one.add_argument("--iterations", type=_count, metavar="N",
-                     help="of Adam in the paper's method; default: 600, with --quick 10")
+                     help="of Adam in the paper's method; default: 1000, with --quick 10")
     one.add_argument("--ways", type=_words, metavar="A,B", help="rows, like cnd,nmpc; default: all that can be run")
 
 
