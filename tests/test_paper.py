@@ -27,7 +27,8 @@ TINY = {"iterations": 4, "batch": 4, "race": 2, "race_iterations": 2, "race_batc
     ({"activation": "gelu"}, "activation"), ({"step": "dopri5"}, "step"), ({"intervals": 0}, "intervals"),
     ({"iterations": 2.5}, "iterations"), ({"batch": True}, "batch"), ({"race": 0}, "race"),
     ({"learning_rate": 0.0}, "learning_rate"), ({"learning_rate": None}, "learning_rate"), ({"decay": 2.0}, "decay"),
-    ({"decay": math.nan}, "decay"), ({"clip": -1.0}, "clip"), ({"clip": "no"}, "clip"),
+    ({"decay": math.nan}, "decay"), ({"near_goal": 0.0}, "near_goal"), ({"clip": -1.0}, "clip"),
+    ({"clip": "no"}, "clip"),
     ({"weights": (1, 1)}, "weights"), ({"weights": (1, -1, 0, 0)}, "weights"), ({"weights": (0, 1, 0, 0)}, "weights"),
     ({"weights": 1.0}, "weights"), ({"step": "euler"}, "step"), ({"hold": 0}, "hold")])
 def test_settings_say_what_is_wrong(wrong, named):
@@ -59,6 +60,17 @@ def test_the_controller_stays_in_U_and_the_networks_have_the_papers_form(time_in
     assert ((u < lb + 1e-3).any(0) & (u > ub - 1e-3).any(0)).all()  # and all of U is within reach
     assert value.nets[0].skip is not None
     assert policy.nets[0].skip is None
+
+
+@pytest.mark.parametrize("problem", [quadrotor, dubins])  # u* inside U, and at its bound
+def test_a_controller_can_start_near_the_goals_control(problem):
+    ocp = problem.ocp()
+    torch.manual_seed(0)
+    policy = controller_net(ocp, PaperSettings(near_goal=1e-6)).double()
+    x = torch.as_tensor(ocp.initial_states.sample(20, 0))
+    u, width = policy(x, torch.zeros(20, 1).double()).detach().numpy(), ocp.system.ubu - ocp.system.lbu
+    near = np.clip(ocp.u_goal, ocp.system.lbu + 0.005 * width, ocp.system.ubu - 0.005 * width)
+    np.testing.assert_allclose(u, np.tile(near, (20, 1)), atol=1e-4 * width.max())
 
 
 @pytest.mark.parametrize("problem", [cartpole, quadrotor, dubins])

@@ -24,6 +24,7 @@ class PaperSettings:
     value_hidden: Sequence[int] = (64, 64)  # widths of the value function's
     activation: str = "tanh"
     time_input: bool = False  # True: u(x, t), which the optimum of a finite horizon needs; the paper has u(x)
+    near_goal: float | None = None  # the controller starts at u*, its last layer's random weights times this; None: off
     sin_cos: bool = True  # sin and cos of declared angles as inputs, beside their values
     intervals: int = 40  # K: steps of a rollout
     step: str = "rk4"  # or "euler", as published
@@ -64,11 +65,12 @@ class PaperSettings:
                 raise ValueError(f"PaperSettings: {name} is {getattr(self, name)!r}; expected {', '.join(known)}")
 
     def _check_numbers(self) -> None:
-        for name in ("learning_rate", "decay", "clip"):
+        for name in ("learning_rate", "decay", "clip", "near_goal"):
             value = getattr(self, name)
-            if not (value is None and name == "clip") and not (_is_number(value) and value > 0):
+            if not (value is None and name in ("clip", "near_goal")) and not (_is_number(value) and value > 0):
                 raise ValueError(f"PaperSettings: {name} is {value!r}; expected a finite number > 0"
-                                 + (", or None for no clipping" if name == "clip" else ""))
+                                 + {"clip": ", or None for no clipping",
+                                    "near_goal": ", or None for weights as random as the others"}.get(name, ""))
         if self.decay > 1:
             raise ValueError(f"PaperSettings: decay is {self.decay!r}; expected at most 1, which is no decay")
         weights: Any = tuple(self.weights) if isinstance(self.weights, (tuple, list)) else (self.weights,)
