@@ -112,8 +112,8 @@ class ValueNet(nn.Module):
         s = torch.cat([x, t], -1)
         _, slopes = self._sweep(s)
         z: Tensor = self.w
-        for K, slope in zip(reversed(self._residual_weights()), reversed(slopes[1:]), strict=True):
-            z = z + (slope * z) @ K / len(self.residual)
+        for i in reversed(range(len(self.residual))):
+            z = z + (slopes[i + 1] * z) @ self.get_parameter(f"residual.{i}.weight") / len(self.residual)
         g = self.scale * ((slopes[0] * z) @ self.opening.weight + (s @ self.A.T) @ self.A + self.b)
         return g[..., :-1], g[..., -1:]
 
@@ -129,28 +129,21 @@ class ValueNet(nn.Module):
 
     def to_casadi(self) -> tuple[ca.Function, ca.Function]:
         """(value:(x, t) -> V, value_gradient:(x, t) -> V_x), native MX."""
-        weights = {name: ca.DM(p.detach().double().numpy()) for name, p in self.named_parameters()}
-        W = [weights[f"{name}.weight"] for name in self._layer_names()]
-        x, t = ca.MX.sym("x", W[0].size2() - 1), ca.MX.sym("t")
-        s, A = ca.vertcat(x, t), weights["A"]
-        a = [ca.mtimes(W[0], s) + weights["opening.bias"]]
-        r, share = _sigma_mx(a[0]), 1 / len(self.residual)
-        for name, K in zip(self._layer_names()[1:], W[1:], strict=True):
-            a.append(ca.mtimes(K, r) + weights[f"{name}.bias"])
+        dm = {name: ca.DM(p.detach().double().numpy()) for name, p in self.named_parameters()}
+        x, t = ca.MX.sym("x", self.opening.in_features - 1), ca.MX.sym("t")
+        s, share = ca.vertcat(x, t), 1 / len(self.residual)
+        a = [ca.mtimes(dm["opening.weight"], s) + dm["opening.bias"]]
+        r = _sigma_mx(a[0])
+        for i in range(len(self.residual)):
+            a.append(ca.mtimes(dm[f"residual.{i}.weight"], r) + dm[f"residual.{i}.bias"])
             r = r + share * _sigma_mx(a[-1])
-        As, z = ca.mtimes(A, s), ca.MX(weights["w"])
-        V = ca.dot(weights["w"], r) + ca.sumsqr(As) / 2 + ca.dot(weights["b"], s) + weights["c"]
-        for K, a_i in zip(reversed(W[1:]), reversed(a[1:]), strict=True):
-            z = z + share * ca.mtimes(K.T, ca.tanh(a_i) * z)
-        g = ca.mtimes(W[0].T, ca.tanh(a[0]) * z) + ca.mtimes(A.T, As) + weights["b"]
+        As, z = ca.mtimes(dm["A"], s), ca.MX(dm["w"])
+        V = ca.dot(dm["w"], r) + ca.sumsqr(As) / 2 + ca.dot(dm["b"], s) + dm["c"]
+        for i in reversed(range(len(self.residual))):
+            z = z + share * ca.mtimes(dm[f"residual.{i}.weight"].T, ca.tanh(a[i + 1]) * z)
+        g = ca.mtimes(dm["opening.weight"].T, ca.tanh(a[0]) * z) + ca.mtimes(dm["A"].T, As) + dm["b"]
         return (ca.Function("value", [x, t], [self.scale * V], ["x", "t"], ["V"]),
                 ca.Function("value_gradient", [x, t], [self.scale * g[:-1]], ["x", "t"], ["V_x"]))
-
-    def _layer_names(self) -> list[str]:
-        return ["opening", *(f"residual.{i}" for i in range(len(self.residual)))]
-
-    def _residual_weights(self) -> list[Tensor]:
-        return [p for name, p in self.residual.named_parameters() if name.endswith("weight")]
 
     def sizes(self) -> dict[str, Any]:
         """What it was constructed with."""

