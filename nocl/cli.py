@@ -134,7 +134,12 @@ def _add_tables(sub: argparse.ArgumentParser) -> None:
     one.add_argument("--grid", type=_grid, metavar="A,B,C", help="nodes of the level sets; default: 46,73,81")
     one.add_argument("--ways", type=_words, metavar="A,B", help="rows, like rrt-100,cnd; default: all eight")
     _add_control(table("gym", _reproduce_control, "acrobot and cart-pole by learned dynamics: CND, NMPC"))
-    _add_control(table("quadrotor", _reproduce_control, "the quadrotor, f known and not: CND, NeuralOC, NMPC, LQR"))
+    one = table("quadrotor", _reproduce_control, "the quadrotor, f known and not: CND, NeuralOC, NMPC, LQR")
+    _add_control(one)
+    one.add_argument("--oc-iterations", type=_count, metavar="N",
+                     help="of Adam in NeuralOC; default: 6000 as published, with --quick 20")
+    one.add_argument("--oc-batch", type=_count, metavar="N",
+                     help="initial states in each of those; default: 1024 as published, with --quick 16")
     one = table("approaches", _reproduce_approaches, "which approach gives what: time and memory by number of states")
     one.add_argument("--problems", type=_words, metavar="A,B", help="default: six, of 2 to 12 states")
 
@@ -266,7 +271,8 @@ def _reproduce_dubins(args: argparse.Namespace) -> None:
 def _reproduce_control(args: argparse.Namespace) -> None:
     from nocl.comparisons.reproduce import control, control_tables
 
-    given = {"n": args.n, "seeds": args.seeds, "iterations": args.iterations, "ways": args.ways}
+    given = {name: getattr(args, name, None)
+             for name in ("n", "seeds", "iterations", "oc_iterations", "oc_batch", "ways")}
     chosen = {name: value for name, value in given.items() if value is not None}
     plan = control.Plan(args.table, quick=args.quick, **((control.QUICK if args.quick else {}) | chosen))
     _check_out(args.out)

@@ -156,7 +156,8 @@ def test_the_command_resumes_and_keeps_the_cells(tmp_path, monkeypatch, capsys):
     assert "2 x 2" in capsys.readouterr().out
     first = control.finished(tmp_path, "gym")
     assert [(c.seed, c.problem) for c in first] == [(0, "acrobot"), (0, "cartpole"), (1, "acrobot"), (1, "cartpole")]
-    assert control.run(tmp_path, Plan("gym", 2, 2, 10, True, ("cnd",)), progress=False) == first
+    plan = Plan("gym", 2, 2, 10, quick=True, ways=("cnd",))
+    assert control.run(tmp_path, plan, progress=False) == first
     (tmp_path / "cells" / "gym-acrobot-cnd-0.json").write_text("{}")
     with pytest.raises(ValueError, match="no cell of the tables of control"):
         control.finished(tmp_path, "gym")

@@ -39,6 +39,7 @@ CELLS = "cells"
 HIDDEN = 500_000  # + seed: the seed of the initial states that cells are judged on
 DRAWN = 6  # trajectories that a cell of the quadrotor keeps for the figure
 NODES = 41  # of those
+OC_DROPS = 5  # of NeuralOC's learning rate while it trains
 POSITION = ("px", "py", "pz")
 
 
@@ -50,13 +51,15 @@ class Plan:
     n: int = 1000
     seeds: int = 3
     iterations: int = 1000  # of Adam, of the paper's method
+    oc_iterations: int = 6000  # of Adam, of NeuralOC, with as many drops of the learning rate as published
+    oc_batch: int = 1024  # initial states in each of those
     quick: bool = False  # small budgets everywhere
     ways: tuple[str, ...] = ()  # default: all
 
     def __post_init__(self) -> None:
         if self.table not in TABLES:
             raise ValueError(f"reproduce: the table is {self.table!r}; expected {' or '.join(TABLES)}")
-        for name in ("n", "seeds", "iterations"):
+        for name in ("n", "seeds", "iterations", "oc_iterations", "oc_batch"):
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise ValueError(f"reproduce {self.table}: {name} is {value!r}; expected an integer >= 1")
@@ -257,9 +260,10 @@ def _lqr(task: Task) -> Made:
 def _neural_oc(task: Task) -> Made:
     from nocl.solvers.neural_oc import NeuralOCSettings, train_neural_oc
 
-    settings = NeuralOCSettings()
+    n = task.plan.oc_iterations
+    settings = NeuralOCSettings(iterations=n, batch=task.plan.oc_batch, drop_every=math.ceil(n / OC_DROPS))
     if task.plan.quick:
-        settings = replace(settings, iterations=20, batch=16, width=16, check_every=10)
+        settings = replace(settings, width=16, check_every=5)
     controller = train_neural_oc(task.ocp, settings, seed=task.seed, progress=False)
     return Made(controller, f"{settings.iterations} iterations of {settings.batch} rollouts", controller.card["nfe"])
 
@@ -294,7 +298,7 @@ QUADROTOR = Table("quadrotor", ("quadrotor",), {
     "neural-oc": Way("NeuralOC", _neural_oc, False, {"quadrotor": Published(0.4601, 0.1552, 45.9289, 17.8367)})})
 
 TABLES = {"gym": GYM, "quadrotor": QUADROTOR}
-QUICK = {"n": 8, "seeds": 1, "iterations": 10}
+QUICK = {"n": 8, "seeds": 1, "iterations": 10, "oc_iterations": 20, "oc_batch": 16}
 
 
 def _key(plan: Plan, name: str) -> dict[str, Any]:
@@ -302,6 +306,8 @@ def _key(plan: Plan, name: str) -> dict[str, Any]:
     key: dict[str, Any] = {"n": plan.states(way), "quick": plan.quick}
     if name.endswith(("paper", "paper-learned")):
         key["iterations"] = plan.iterations
+    if name == "neural-oc":
+        key |= {"iterations": plan.oc_iterations, "batch": plan.oc_batch}
     return key
 
 
