@@ -15,6 +15,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -32,9 +33,10 @@ from nocl.simulate import Simulation, simulate
 from nocl.solvers.bank import better
 from nocl.solvers.cnd.labels import policy_controls
 from nocl.solvers.ddp import DDP, DDPSolution
-from nocl.solvers.global_search import solve_globally
+from nocl.solvers.global_search import cold_controls, solve_globally
 
 FINE = 640  # intervals of the reference
+COLD = 48  # cold starts from each of the worst states
 
 
 def optimum(ocp: OCP, x0: Array, policy: FeatureNet) -> DDPSolution:
@@ -59,6 +61,16 @@ def cost_of_kicks(ocp: OCP, policy: FeatureNet, run: Simulation, kicks: list[tup
     return total
 
 
+def explained(ocp: OCP, x0: Array, gap: float, cost: float) -> dict[str, Any]:
+    """One of the worst initial states: what the controller costs there beside the optima of COLD cold starts."""
+    ddp = DDP(ocp)
+    s = ddp.solve(np.repeat(x0[None], COLD, axis=0), u=cold_controls(ddp, COLD, seed=5))
+    found = np.sort(s.cost[s.success])
+    apart = np.append(True, np.diff(found) > 1e-3 * found[:-1]) if len(found) else []
+    return {"x0": [round(v, 4) for v in x0.tolist()], "gap_%": round(100 * gap, 3), "controller": round(cost, 5),
+            "optima": [round(float(v), 5) for v in found[apart][:6]]}
+
+
 def quantiles(gap: Array) -> dict[str, float]:
     return {"median_%": round(100 * float(np.median(gap)), 4), "p95_%": round(100 * float(np.quantile(gap, 0.95)), 4),
             "max_%": round(100 * float(gap.max()), 3)}
@@ -74,7 +86,7 @@ def score(ocp: OCP, cnd: nocl.CND, n: int, sigma: float, seed: int = 12345) -> d
     row = {"failed": int((~run.success).sum() + (~best.success).sum()), "J*": round(float(best.cost.mean()), 5),
            "gap": quantiles(gap), "terminal_error": round(float(run.terminal_error.mean()), 4),
            "control": round(float(run.control_magnitude.mean()), 3), "collisions": int((run.clearance < 0).sum()),
-           "worst_x0": [[round(v, 4) for v in x0[i].tolist()] for i in np.argsort(-gap)[:3]]}
+           "worst": [explained(ocp, x0[i], float(gap[i]), float(run.cost[i])) for i in np.argsort(-gap)[:3]]}
     slots = np.sort(rng.choice(np.arange(1, SLOTS - 1), 5, replace=False))
     pushes = [(int(s), sigma * rng.standard_normal(x0.shape)) for s in slots]
     kicked = simulate(ocp, cnd, x0, kicks=[(s * ocp.horizon / SLOTS, dx) for s, dx in pushes])
@@ -94,6 +106,15 @@ def _cosine(a: Array, b: Array) -> Array:
     return (a * b).sum(1) / np.linalg.norm(a, axis=1) / np.linalg.norm(b, axis=1)
 
 
+def trained(ocp: OCP, dynamics: str, seed: int, keep: Path | None) -> tuple[nocl.CND, dict[str, float]]:
+    """A controller and the seconds of its training, of the clock and of all threads; what is kept is what is scored."""
+    model = nocl.identify(ocp.system, seed=seed) if dynamics == "learned" else None
+    clock, cpu = time.perf_counter(), time.process_time()
+    cnd = nocl.train(ocp, model, seed=seed)
+    clock, cpu = time.perf_counter() - clock, time.process_time() - cpu
+    return (cnd.rounded() if keep else cnd), {"train_seconds": round(clock, 1), "train_cpu_seconds": round(cpu, 1)}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("problems", nargs="*", default=["cartpole", "acrobot", "quadrotor", "dubins", "pendulum"])
@@ -104,23 +125,16 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="save the controllers of the first seed in this folder")
     parser.add_argument("--results", default="controllers", help="benchmarks/results/RESULTS.json")
     options, rows = parser.parse_args(), []
-    for problem in options.problems:
-        ocp = nocl.load_ocp(problem)
-        for dynamics in options.dynamics:
-            for seed in options.seeds:
-                model = nocl.identify(ocp.system, seed=seed) if dynamics == "learned" else None
-                start = time.perf_counter()
-                cnd = nocl.train(ocp, model, seed=seed)
-                seconds = round(time.perf_counter() - start, 1)
-                if options.keep and seed == options.seeds[0]:
-                    cnd = cnd.rounded()  # what is kept is what is scored
-                rows.append({"problem": problem, "dynamics": dynamics, "seed": seed, "train_seconds": seconds,
-                             **score(ocp, cnd, options.n, options.sigma)})
-                print(rows[-1], flush=True)
-                provenance.write(options.results, rows, n=options.n, sigma=options.sigma)
-                if options.keep and seed == options.seeds[0]:
-                    cnd.card["score"] = rows[-1]
-                    cnd.save(options.keep / f"{problem}-{dynamics}")
+    for seed, problem, dynamics in product(options.seeds, options.problems, options.dynamics):
+        ocp, keep = nocl.load_ocp(problem), options.keep if seed == options.seeds[0] else None
+        cnd, seconds = trained(ocp, dynamics, seed, keep)
+        rows.append({"problem": problem, "dynamics": dynamics, "seed": seed, **seconds,
+                     **score(ocp, cnd, options.n, options.sigma)})
+        print(rows[-1], flush=True)
+        provenance.write(options.results, rows, n=options.n, sigma=options.sigma)
+        if keep:
+            cnd.card["score"] = rows[-1]
+            cnd.save(keep / f"{problem}-{dynamics}")
 
 
 if __name__ == "__main__":

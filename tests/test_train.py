@@ -29,7 +29,7 @@ from nocl.solvers.cnd.labels import (
 )
 from nocl.solvers.cnd.regress import fit, policy_loss
 from nocl.solvers.cnd.validate import advice, gap, refined, summary, value_scores
-from nocl.solvers.cnd.value import ROUND, ValueLabels, value_loss, value_net, value_solutions
+from nocl.solvers.cnd.value import ROUND, ValueLabels, on_fine_grid, value_loss, value_net, value_tails
 from nocl.solvers.ddp import DDP
 from nocl.solvers.global_search import solve_globally
 
@@ -39,7 +39,7 @@ QUICK = TrainSettings(intervals=40, seeds=4, starts=2, states=60, tails=400, vis
                       batch=512, hidden=(24, 24), value_tails=800, value_visits=200, value_iterations=800, held_out=16,
                       gap_median=1e-9)
 TINY = replace(QUICK, intervals=20, batch=64, states=10, tails=40, visits=20, rounds=2, iterations=30, hidden=(8,),
-               value_tails=40, value_visits=10, value_iterations=20, held_out=4)
+               value_tails=40, value_visits=10, value_iterations=20, value_rounds=1, held_out=4)
 
 
 def riccati(t, T=2.0, R=0.01):
@@ -179,13 +179,22 @@ def test_the_card_tells_how_training_went(whole, tmp_path):
     for row in rows:
         assert {"labels", "loss", "gap_median", "gap_p95", "kicked_median", "kicked_p95"} <= set(row)
         assert len(row["loss"]) == TINY.iterations * (2 if row["round"] == 2 else 1)
-    assert {"initial_error", "tails_error", "tails_degrees", "tails_slope_error", "hjb_mean"} <= set(value)
+    assert {"initial_error", "tube_error", "tails_error", "tails_degrees", "tails_slope_error", "hjb_mean"} <= set(value)
     assert np.isfinite(list(value.values())[1:]).all()
     assert json.loads(json.dumps(whole.card))["history"] == rows
     picture = whole.plot_training(tmp_path / "run" / "training.png")
     assert picture.read_bytes()[:8] == bytes([137]) + b"PNG\r\n" + bytes([26, 10])
     with pytest.raises(ValueError, match="has no history; expected one of nocl"):
         nocl.CND(whole.ocp, whole.policy).plot_training(tmp_path / "none.png")
+
+
+def test_v_is_fitted_again_until_the_held_out_states_are_met():
+    ocp, tiny = nocl.load_ocp("double_integrator"), replace(TINY, rounds=0, value_rounds=2)
+    met, missed = (nocl.train(ocp, settings=replace(tiny, value_error=e), seed=1, progress=False).card["value"]
+                   for e in (1e3, 1e-9))
+    assert missed["labels"] > met["labels"]
+    assert len(missed["loss"]) > len(met["loss"]) == TINY.value_iterations
+    assert missed["tube_error"] < met["tube_error"]
 
 
 def test_the_papers_run_is_drawn_too(whole, tmp_path):
@@ -236,12 +245,12 @@ def test_value_scores_are_zero_for_the_exact_value():
         return nocl.to_torch(ca.Function("V", [x, t], [x.T @ S @ x]))(X, T)
 
     policy = nocl.to_torch(ca.Function("u", [x, t], [-(S[1, :] @ x) / 0.01]))
-    row = value_scores(ocp, value, policy, nocl.to_torch(ocp.system.f), starts, starts)
+    row = value_scores(ocp, value, policy, nocl.to_torch(ocp.system.f), {"initial": starts, "tails": starts})
     assert row["tails_error"] < 1e-4
     assert row["tails_degrees"] < 0.1
     assert row["tails_slope_error"] < 1e-4
     assert row["hjb_mean"] < 1e-10
-    twice = value_scores(ocp, lambda X, T: 2 * value(X, T), policy, nocl.to_torch(ocp.system.f), starts, starts)
+    twice = value_scores(ocp, lambda X, T: 2 * value(X, T), policy, nocl.to_torch(ocp.system.f), {"initial": starts, "tails": starts})
     assert twice["initial_error"] == pytest.approx(1.0, abs=1e-3)
     assert twice["initial_slope_error"] == pytest.approx(1.0, abs=1e-3)
     assert twice["hjb_mean"] > 0.1
@@ -447,8 +456,9 @@ def test_policy_loss_counts_what_costs():
 def test_value_labels_are_costs_to_go_on_the_fine_grid(pendulum):
     ocp, ddp, bank, f = pendulum
     fine = DDP(ocp, intervals=160)
-    whole, tails = value_solutions(ddp, fine, bank, feedback(ocp), f, tails=12, visits=8, width=0.25, kick=0.1,
-                                   rng=np.random.default_rng(0))
+    (whole,) = on_fine_grid(fine, bank.solution)
+    (tails,) = on_fine_grid(fine, value_tails(ddp, bank, feedback(ocp), f, tails=12, visits=8, width=0.25, kick=0.1,
+                                              rng=np.random.default_rng(0)))
     assert len(whole) == len(bank)
     assert (whole.cost <= bank.solution.cost).all()  # what is held for shorter costs less
     labels = ValueLabels.of([whole, tails])

@@ -38,14 +38,16 @@ from nocl.solvers.cnd.regress import fit, policy_loss
 from nocl.solvers.cnd.settings import TrainSettings
 from nocl.solvers.cnd.validate import (
     advice,
+    feasible,
     gap,
     held_gap,
     held_out_optima,
     kicked_optima,
     summary,
+    tube_optima,
     value_scores,
 )
-from nocl.solvers.cnd.value import ValueLabels, value_loss, value_net, value_solutions
+from nocl.solvers.cnd.value import ValueLabels, on_fine_grid, value_loss, value_net, value_tails
 from nocl.solvers.ddp import DDP, DDPSolution
 from nocl.solvers.global_search import solve_globally
 from nocl.threads import one_thread
@@ -232,25 +234,54 @@ class _Training:
         return bool(last["gap_median"] <= s.gap_median and last["gap_p95"] <= s.gap_p95)
 
     def _value(self) -> FeatureNet:
-        s, rng = self.settings, self._rng(2_000_000)
-        with self._stage("value labels", 1) as bar:
-            labels = ValueLabels.of(value_solutions(self.ddp, self.fine, self.bank, self.policy, self.f,
-                                                    tails=s.value_tails, visits=s.value_visits, width=s.width,
-                                                    kick=s.kick, rng=rng))
-            bar.update()
-        with _seeded(self.seed + 1):
-            net = value_net(self.ocp, labels, s.hidden)
-        loss = value_loss(net, labels, self.bank.scale)
-        with self._stage("value function", s.value_iterations) as bar:
-            report = _Reporter(bar, s.value_iterations)
-            fit(net, loss, len(labels), iterations=s.value_iterations, batch=s.batch // 2 or 1, lr=s.lr,
-                seed=self.seed, report=report)
+        """V, fitted once more on twice the labels where the held-out states ask for it."""
+        s, rng, losses = self.settings, self._rng(2_000_000), list[float]()
+        labels, optima = ValueLabels.of(on_fine_grid(self.fine, self.bank.solution)), self._value_optima()
+        for attempt in range(s.value_rounds):
+            labels = ValueLabels.join([labels, self._value_labels(rng)])
+            if attempt == 0:
+                with _seeded(self.seed + 1):
+                    net = value_net(self.ocp, labels, s.hidden)
+            losses += self._fit_value(net, labels, attempt)
+            scores = value_scores(self.ocp, net, self.policy, self.f, optima)
+            if max(scores[f"{name}_error"] for name in optima) <= s.value_error:
+                break
+        self.value_card = {"loss": losses, "labels": len(labels), **scores}
+        return net
+
+    def _value_optima(self) -> dict[str, DDPSolution]:
+        """What V is told by: initial states, states of the tube, and states of kicked rollouts, solved anew."""
         if not hasattr(self, "starts"):  # taken up after the last round
             self._validate()
             self.history.pop()
-        scores = value_scores(self.ocp, net, self.policy, self.f, self.starts, self.tails)
-        self.value_card = {"loss": report.kept, **scores}
-        return net
+        s = self.settings
+        with self._stage("held-out states of the tube", 1) as bar:
+            tube_ = tube_optima(self.ddp, self.fine, self.bank, self.policy, self.f, 4 * s.held_out, s.width,
+                                self._rng(3_000_000))
+            bar.update()
+        sets = {"initial": self.starts, "tube": tube_, "tails": self.tails}
+        return {name: feasible(self.ocp, optima) for name, optima in sets.items()}
+
+    def _value_labels(self, rng: np.random.Generator) -> ValueLabels:
+        s = self.settings
+        with self._stage("value labels", 1) as bar:
+            found = value_tails(self.ddp, self.bank, self.policy, self.f, tails=s.value_tails, visits=s.value_visits,
+                                width=s.width, kick=s.kick, rng=rng)
+            labels = ValueLabels.of(on_fine_grid(self.fine, found))
+            bar.update()
+        return labels
+
+    def _fit_value(self, net: FeatureNet, labels: ValueLabels, attempt: int) -> list[float]:
+        s = self.settings
+        iterations, batch = s.value_iterations, s.batch // 2 or 1
+        if attempt:
+            iterations, batch = 7 * iterations // 5, s.batch
+        loss = value_loss(net, labels, self.bank.scale)
+        with self._stage("value function" + (", once more" if attempt else ""), iterations) as bar:
+            report = _Reporter(bar, iterations)
+            fit(net, loss, len(labels), iterations=iterations, batch=batch, lr=s.lr, seed=self.seed + attempt,
+                report=report)
+        return report.kept
 
     def _card(self) -> dict[str, Any]:
         last = self.history[-1]

@@ -12,7 +12,7 @@ from nocl.hjb import hjb_residual, rollout
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.bank import SolutionBank, extend
-from nocl.solvers.cnd.labels import SMALL, Field, answered, continuous_cost, kicked_states
+from nocl.solvers.cnd.labels import SMALL, Field, answered, continuous_cost, kicked_states, tube_states
 from nocl.solvers.ddp import DDP, DDPSolution
 from nocl.to_torch import to_torch
 
@@ -35,6 +35,22 @@ def kicked_optima(ddp: DDP, fine: DDP, bank: SolutionBank, policy: torch.nn.Modu
                   rng: np.random.Generator) -> DDPSolution:
     """The optima from n states that the policy visits under kicks, at times all over the horizon."""
     x, t0 = kicked_states(ddp.ocp, bank, policy, f, n, kick, rng)
+    return refined(fine, answered(ddp, bank, policy, f, x, t0))
+
+
+def feasible(ocp: OCP, s: DDPSolution) -> DDPSolution:
+    """The solutions that hold the path constraints at all nodes: where a collision can no longer be avoided, V is that
+    of the penalty."""
+    if not ocp.path_constraints:
+        return s
+    h = to_torch(ocp.h)(torch.from_numpy(s.x.reshape(-1, s.x.shape[2])))
+    return s[(h.numpy() >= 0).all(axis=1).reshape(s.x.shape[:2]).all(axis=1)]
+
+
+def tube_optima(ddp: DDP, fine: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, n: int, width: float,
+                rng: np.random.Generator) -> DDPSolution:
+    """The optima from n states of the tube."""
+    _, t0, x = tube_states(bank, n, width, ddp.ocp.horizon, rng)
     return refined(fine, answered(ddp, bank, policy, f, x, t0))
 
 
@@ -61,21 +77,22 @@ def summary(shares: Array, name: str) -> dict[str, float]:
     return {f"{name}_median": float(median), f"{name}_p95": float(p95)}
 
 
-def value_scores(ocp: OCP, value: FeatureNet, policy: torch.nn.Module, f: Field, starts: DDPSolution,
-                 tails: DDPSolution) -> dict[str, float]:
-    """|V - J*| / |J*| (mean, at initial states and on tails), V_x against costates (medians), the HJB residual.
+def value_scores(ocp: OCP, value: FeatureNet, policy: torch.nn.Module, f: Field,
+                 optima: dict[str, DDPSolution]) -> dict[str, float]:
+    """|V - J*| / |J*| (mean and median), V_x against costates (medians) of each set of optima; the HJB residual.
 
-    The residual V_t + L + V_x' f is taken at the policy's u along the tails, in units of their mean running cost.
+    The residual V_t + L + V_x' f is taken at the policy's u along the last set, in units of its mean running cost.
     """
     row: dict[str, float] = {}
-    for name, s in (("initial", starts), ("tails", tails)):
+    for name, s in optima.items():
         V, V_x = _value_and_slope(value, s.x[:, 0], s.t[:, 0])
-        row[f"{name}_error"] = float(np.mean(np.abs(V - s.cost) / np.abs(s.cost)))
+        error = np.abs(V - s.cost) / np.abs(s.cost)
+        row |= {f"{name}_error": float(error.mean()), f"{name}_error_median": float(np.median(error))}
         size, true = np.linalg.norm(V_x, axis=1), np.linalg.norm(s.V_x[:, 0], axis=1)
         cosine = np.clip((V_x * s.V_x[:, 0]).sum(axis=1) / (size * true), -1, 1)
         row[f"{name}_degrees"] = float(np.degrees(np.median(np.arccos(cosine))))
         row[f"{name}_slope_error"] = float(np.median(np.abs(size / true - 1)))
-    return row | _hjb(ocp, value, policy, f, tails)
+    return row | _hjb(ocp, value, policy, f, s)
 
 
 def _value_and_slope(value: FeatureNet, x: Array, t: Array) -> tuple[Array, Array]:
@@ -101,7 +118,7 @@ def _hjb(ocp: OCP, value: FeatureNet, policy: torch.nn.Module, f: Field, tails: 
 def advice(row: dict[str, Any], rounds: int, held_out: int) -> str | None:
     """What to say, and to try, where the last round's gap is large or few states tell it; None where it is well."""
     if row["unsolved"] > 0.1 * held_out:
-        return (f"{row['unsolved']} of {held_out} held-out initial states could not be solved, and the gap is that of the "
+        return (f"{row['unsolved']} of {held_out} held-out initial states could not be solved, the gap is that of the "
                 "others: try TrainSettings with more seeds and starts, or more intervals where the dynamics are fast")
     if row["gap_median"] <= 0.01 and row["gap_p95"] <= 0.2:
         return None

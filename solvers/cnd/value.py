@@ -54,18 +54,27 @@ class ValueLabels:
         return ValueLabels(*(np.concatenate(column) for column in zip(*filter(None, parts), strict=True)))
 
 
-def value_solutions(ddp: DDP, fine: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, *, tails: int,
-                    visits: int, width: float, kick: float, rng: np.random.Generator) -> Iterator[DDPSolution]:
-    """The bank's solutions, and tails from states of the tube and from those that the policy visits under kicks, on
-    the fine grid: a held control costs O(h^2) more than a continuous one. Piece by piece: they take much memory."""
+    @staticmethod
+    def join(parts: Iterable[ValueLabels]) -> ValueLabels:
+        parts = list(parts)
+        return ValueLabels(*(np.concatenate([getattr(p, n) for p in parts]) for n in ValueLabels.__dataclass_fields__))
+
+
+def value_tails(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, *, tails: int, visits: int,
+                width: float, kick: float, rng: np.random.Generator) -> DDPSolution:
+    """Tails from states of the tube and from those that the policy visits under kicks."""
     _, t0, x = tube_states(bank, tails, width, ddp.ocp.horizon, rng)
     x_kicked, t_kicked = kicked_states(ddp.ocp, bank, policy, f, visits, kick, rng)
-    found = answered(ddp, bank, policy, f, np.concatenate([x, x_kicked]), np.concatenate([t0, t_kicked]))
-    times = fine.intervals // ddp.intervals
-    for all_of in (bank.solution, found[found.success]):
-        for start in range(0, len(all_of), PIECE):
-            s = all_of[start:start + PIECE]
-            yield fine.solve(s.x[:, 0], s.t[:, 0], u=np.repeat(s.u, times, axis=1))
+    return answered(ddp, bank, policy, f, np.concatenate([x, x_kicked]), np.concatenate([t0, t_kicked]))
+
+
+def on_fine_grid(fine: DDP, coarse: DDPSolution) -> Iterator[DDPSolution]:
+    """The solutions that succeeded, solved again on the fine grid: a held control costs O(h^2) more than a continuous
+    one. Piece by piece: they take much memory."""
+    s = coarse[coarse.success]
+    for start in range(0, len(s), PIECE):
+        p = s[start:start + PIECE]
+        yield fine.solve(p.x[:, 0], p.t[:, 0], u=np.repeat(p.u, fine.intervals // p.u.shape[1], axis=1))
 
 
 def value_net(ocp: OCP, labels: ValueLabels, sizes: tuple[int, ...]) -> FeatureNet:
