@@ -291,7 +291,8 @@ class _Trainer:
             torch.manual_seed(int(self.rng.integers(2**31)))
             self.net = ValueNet(ocp.system.nx, settings.width, settings.layers, settings.rank, _scale(ocp)).to(dtype)
         self.nfe, self.rows = 0, list[list[float]]()  # rows: the terms of each iteration
-        self.held_out = self.states()
+        self.adam = torch.optim.Adam(self.net.parameters(), lr=settings.learning_rate)
+        self.held_out, self.x0 = self.states(), self.states()
         self.best, self.lowest, self.best_iteration = copy.deepcopy(self.net.state_dict()), math.inf, 0
 
     def states(self) -> Tensor:
@@ -321,25 +322,28 @@ class _Trainer:
         return terms @ torch.tensor([1.0, 1.0, *self.settings.weights], dtype=self.dtype)
 
     def train(self, progress: bool | None) -> None:
-        s = self.settings
-        adam = torch.optim.Adam(self.net.parameters(), lr=s.learning_rate)
-        hidden = None if progress is None else not progress
-        x0 = self.states()
-        for k in (bar := tqdm(range(1, s.iterations + 1), f"NeuralOC on {self.ocp.system.name}", disable=hidden)):
-            terms = self.terms(x0)
-            adam.zero_grad()
-            self.loss(terms).backward()
-            self.rows.append(terms.tolist())
-            self.check_finite()
-            adam.step()
+        """All iterations that are left."""
+        todo, hidden = range(len(self.rows), self.settings.iterations), None if progress is None else not progress
+        for _ in (bar := tqdm(todo, f"NeuralOC on {self.ocp.system.name}", disable=hidden)):
+            self.iteration()
             bar.set_postfix({n: f"{v:.3g}" for n, v in zip(TERMS, self.rows[-1], strict=True)}, refresh=False)
-            if k % s.check_every == 0 or k == s.iterations:
-                self.look(k)
-            if k % s.drop_every == 0:
-                self.net.load_state_dict(self.best)
-                adam.param_groups[0]["lr"] *= s.drop
-            if k % s.resample_every == 0:
-                x0 = self.states()
+
+    def iteration(self) -> None:
+        """One step of Adam, and what is due after it."""
+        s, terms = self.settings, self.terms(self.x0)
+        self.adam.zero_grad()
+        self.loss(terms).backward()
+        self.rows.append(terms.tolist())
+        self.check_finite()
+        self.adam.step()
+        k = len(self.rows)
+        if k % s.check_every == 0 or k == s.iterations:
+            self.look(k)
+        if k % s.drop_every == 0:
+            self.net.load_state_dict(self.best)
+            self.adam.param_groups[0]["lr"] *= s.drop
+        if k % s.resample_every == 0:
+            self.x0 = self.states()
 
     def look(self, iteration: int) -> None:
         """The loss on held-out states; the best network is kept."""
