@@ -275,7 +275,7 @@ class _Training:
         s = self.settings
         iterations, batch = s.value_iterations, s.batch // 2 or 1
         if attempt:
-            iterations, batch = 7 * iterations // 5, s.batch
+            iterations, batch = 2 * iterations, s.batch
         loss = value_loss(net, labels, self.bank.scale)
         with self._stage("value function" + (", once more" if attempt else ""), iterations) as bar:
             report = _Reporter(bar, iterations)
