@@ -1,6 +1,7 @@
 """Trained controllers as feedback: the gap to the optimum in continuous time, on hidden states, and under kicks.
 
     python benchmarks/controllers.py [PROBLEM ...] [--dynamics exact learned] [--seeds 0 1 2] [--n 200]
+    python benchmarks/controllers.py --table pretrained controllers      # the results of those files as markdown
 
 Every controller is judged by CVODES on the exact f, as continuous feedback, from initial states that training did not
 see. J* is the continuous-time optimum: the best of DDP's cold starts, neighbours and the controller's own rollout, with
@@ -13,6 +14,7 @@ controller loses between kicks, each stretch against the optimum from the state 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import time
 from itertools import product
@@ -98,6 +100,8 @@ def score(ocp: OCP, cnd: nocl.CND, n: int, sigma: float, seed: int = 12345) -> d
     V = cnd.value(x0, 0.0)
     row["value_error_%"] = round(100 * float(np.mean(np.abs(V / best.cost - 1))), 3)
     cosine = _cosine(cnd.value_gradient(x0, 0.0), best.V_x[:, 0])
+    for where in ("tube", "tails"):  # states of the tube and of kicked rollouts that training did not see
+        row[f"value_error_{where}_%"] = round(100 * cnd.card["value"][f"{where}_error"], 3)
     row["value_gradient_degrees"] = round(float(np.degrees(np.median(np.arccos(np.clip(cosine, -1, 1))))), 2)
     return row
 
@@ -115,6 +119,39 @@ def trained(ocp: OCP, dynamics: str, seed: int, keep: Path | None) -> tuple[nocl
     return (cnd.rounded() if keep else cnd), {"train_seconds": round(clock, 1), "train_cpu_seconds": round(cpu, 1)}
 
 
+COLUMNS = {"gap: median, %": ("gap", "median_%"), "95th percentile": ("gap", "p95_%"),
+           "5 kicks: median, %": ("kicked_gap", "median_%"), "95th percentile, kicked": ("kicked_gap", "p95_%"),
+           "lost by kicks: median, %": ("kicked_loss", "median_%"), "V: mean error, %": ("value_error_%",), "in the tube": ("value_error_tube_%",),
+           "on kicked states": ("value_error_tails_%",),
+           "grad V, degrees": ("value_gradient_degrees",), "terminal error": ("terminal_error",),
+           "mean control": ("control",), "collisions": ("collisions",), "failed": ("failed",),
+           "training, CPU s": ("train_cpu_seconds",)}
+
+
+def table(names: list[str]) -> str:
+    """Results of several files as markdown: a line a problem and dynamics, each figure from its least to its largest
+    over the seeds."""
+    rows = [row for name in names for row in json.loads((provenance.RESULTS / f"{name}.json").read_text())["rows"]]
+    groups: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    for row in rows:
+        groups.setdefault((row["problem"], row["dynamics"]), []).append(row)
+    lines = ["| " + " | ".join(["problem", "dynamics", "seeds", *COLUMNS]) + " |", "| --- " * (len(COLUMNS) + 3) + "|"]
+    for (problem, dynamics), group in groups.items():
+        seeds = ", ".join(str(s) for s in sorted(row["seed"] for row in group))
+        cells = [problem, dynamics, seeds, *(spread(group, path) for path in COLUMNS.values())]
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def spread(rows: list[dict[str, Any]], path: tuple[str, ...]) -> str:
+    """The least and the largest of a figure, once where they are the same."""
+    values: list[Any] = list(rows)
+    for key in path:
+        values = [v[key] for v in values]
+    least, most = min(values), max(values)
+    return f"{least:g}" if least == most else f"{least:g} .. {most:g}"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("problems", nargs="*", default=["cartpole", "acrobot", "quadrotor", "dubins", "pendulum"])
@@ -124,7 +161,11 @@ def main() -> None:
     parser.add_argument("--sigma", type=float, default=0.05)
     parser.add_argument("--keep", type=Path, help="save the controllers of the first seed in this folder")
     parser.add_argument("--results", default="controllers", help="benchmarks/results/RESULTS.json")
+    parser.add_argument("--table", nargs="+", metavar="RESULTS", help="nothing is trained; these files as markdown")
     options, rows = parser.parse_args(), []
+    if options.table:
+        print(table(options.table))
+        return
     for seed, problem, dynamics in product(options.seeds, options.problems, options.dynamics):
         ocp, keep = nocl.load_ocp(problem), options.keep if seed == options.seeds[0] else None
         cnd, seconds = trained(ocp, dynamics, seed, keep)
