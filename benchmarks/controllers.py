@@ -121,8 +121,8 @@ def trained(ocp: OCP, dynamics: str, seed: int, keep: Path | None) -> tuple[nocl
 
 COLUMNS = {"gap: median, %": ("gap", "median_%"), "95th percentile": ("gap", "p95_%"),
            "5 kicks: median, %": ("kicked_gap", "median_%"), "95th percentile, kicked": ("kicked_gap", "p95_%"),
-           "lost by kicks: median, %": ("kicked_loss", "median_%"), "V: mean error, %": ("value_error_%",), "in the tube": ("value_error_tube_%",),
-           "on kicked states": ("value_error_tails_%",),
+           "lost by kicks: median, %": ("kicked_loss", "median_%"), "V: mean error, %": ("value_error_%",),
+           "in the tube": ("value_error_tube_%",), "on kicked states": ("value_error_tails_%",),
            "grad V, degrees": ("value_gradient_degrees",), "terminal error": ("terminal_error",),
            "mean control": ("control",), "collisions": ("collisions",), "failed": ("failed",),
            "training, CPU s": ("train_cpu_seconds",)}
