@@ -1,6 +1,7 @@
 """Table I made again: cells are kept and taken up, other budgets make them anew, and every form says the same."""
 
 import csv
+import dataclasses
 import io
 
 import pytest
@@ -54,6 +55,14 @@ def test_entries_are_means_over_seeds(made):
     assert (entry.lowest, entry.highest) == tuple(sorted(c.score.mean for c in own))
     assert entry.seeds == 2
     assert sysid.table(cells)["dubins", "nocl"].mean < 1e-12
+
+
+def test_cells_of_smaller_budgets_are_not_averaged_with_the_others(made):
+    _, cells = made
+    cell = next(c for c in cells if c.way == "relu-values")
+    score = dataclasses.replace(cell.score, mean=10 * cell.score.mean)
+    short = dataclasses.replace(cell, seed=7, score=score, settings={**cell.settings, "iterations": 1})
+    assert sysid.table([*cells, short]) == sysid.table(cells)
 
 
 def test_all_forms_hold_every_cell(made, tmp_path):

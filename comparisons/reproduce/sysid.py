@@ -187,11 +187,17 @@ class Entry:
 
 
 def table(cells: Sequence[Cell]) -> dict[tuple[str, str], Entry]:
-    """(system, way) -> entry, for what there is."""
+    """(system, way) -> entry, for what there is; of cells with different budgets, those with the largest."""
     groups: dict[tuple[str, str], list[Cell]] = {}
     for cell in cells:
         groups.setdefault((cell.system, cell.way), []).append(cell)
-    return {key: Entry.of(group) for key, group in groups.items()}
+    return {key: Entry.of(_dearest(group)) for key, group in groups.items()}
+
+
+def _dearest(cells: Sequence[Cell]) -> list[Cell]:
+    """The cells made like the one with the most samples and iterations."""
+    most = max((c.settings for c in cells), key=lambda s: (s.get("samples", 0), s.get("iterations", 0)))
+    return [c for c in cells if c.settings == most]
 
 
 def published(system: str, way: str) -> Sequence[float] | None:
