@@ -152,6 +152,8 @@ def _add_control(one: argparse.ArgumentParser) -> None:
     one.add_argument("--iterations", type=_count, metavar="N",
                      help="of Adam in the paper's method; default: 1000, with --quick 10")
     one.add_argument("--ways", type=_words, metavar="A,B", help="rows, like cnd,nmpc; default: all that can be run")
+    one.add_argument("--shipped", action="store_true",
+                     help="nocl's default of seed 0 as it comes with nocl, instead of trained anew")
 
 
 def _add(sub: argparse.ArgumentParser, *names: str) -> None:
@@ -274,7 +276,8 @@ def _reproduce_control(args: argparse.Namespace) -> None:
     given = {name: getattr(args, name, None)
              for name in ("n", "seeds", "iterations", "oc_iterations", "oc_batch", "ways")}
     chosen = {name: value for name, value in given.items() if value is not None}
-    plan = control.Plan(args.table, quick=args.quick, **((control.QUICK if args.quick else {}) | chosen))
+    budgets = control.QUICK if args.quick else {}
+    plan = control.Plan(args.table, quick=args.quick, shipped=args.shipped, **(budgets | chosen))
     _check_out(args.out)
     control.run(args.out, plan)
     cells = control.finished(args.out, plan.table)

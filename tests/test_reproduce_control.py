@@ -72,6 +72,19 @@ def test_lqr_flies_to_the_goal_and_its_flight_is_kept():
     np.testing.assert_allclose(path[:, 0], x0[:, :3], atol=1e-3)
 
 
+def test_what_ships_is_judged_without_training():
+    plan = Plan("quadrotor", n=2, shipped=True)
+    made = control.make(plan, "quadrotor", "cnd-learned", 0)
+    card = nocl.pretrained("quadrotor", "learned").card
+    assert made.seconds == card["seconds"]
+    assert math.isnan(made.cpu)
+    assert max(made.error) < 0.1
+    assert made.key["controller"] == control._key(plan, "quadrotor", "cnd-learned", 0)["controller"]
+    assert "controller" not in control._key(plan, "quadrotor", "cnd-learned", 1)  # which is trained
+    entries = control.table([made], "quadrotor")
+    assert f"| {card['seconds']:.0f} |" in control_tables.markdown(entries, "quadrotor")
+
+
 def test_nmpc_runs_in_closed_loop():
     made = control.make(Plan("quadrotor", n=1), "quadrotor", "nmpc", 0)
     x0 = nocl.load_ocp("quadrotor").initial_states.sample(1, control.HIDDEN)

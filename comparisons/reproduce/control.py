@@ -28,6 +28,7 @@ from nocl.checks import Array
 from nocl.comparisons.reproduce.dubins import INTERVALS, rollout_ms
 from nocl.ocp import OCP
 from nocl.simulate import simulate
+from nocl.solvers.compiled import fingerprint
 from nocl.solvers.loop import Loop
 from nocl.systems import load_ocp, quadrotor
 
@@ -42,6 +43,7 @@ NODES = 41  # of those
 # of the paper's method on the quadrotor: with U = [-100, 100]^4 controllers that start at random, or learn at the rate
 # of 0.01, spin the body up within a second and do not learn to fly; held controls are four times as fast to train
 NEAR: dict[str, Any] = {"near_goal": 1e-3, "learning_rate": 3e-3, "race": 1, "hold": True}
+DEFAULTS = ("cnd", "cnd-learned")  # the rows of nocl's default
 OC_DROPS = 5  # of NeuralOC's learning rate while it trains
 POSITION = ("px", "py", "pz")
 
@@ -58,6 +60,7 @@ class Plan:
     oc_batch: int = 1024  # initial states in each of those
     quick: bool = False  # small budgets everywhere
     ways: tuple[str, ...] = ()  # default: all
+    shipped: bool = False  # nocl's default of seed 0 as it comes with nocl, instead of trained anew
 
     def __post_init__(self) -> None:
         if self.table not in TABLES:
@@ -118,6 +121,7 @@ class Made:
     controller: Any  # what nocl.simulate takes; None: there is none, `made` says why
     made: str
     evaluations: float = 0.0
+    seconds: float | None = None  # of training, where that was not now
 
 
 @dataclass(frozen=True)
@@ -159,7 +163,7 @@ def run(out: str | Path, plan: Plan, *, progress: bool = True) -> list[Cell]:
             bar.set_postfix_str(f"{problem}, {table.ways[name].title}, seed {seed}")
             path = folder / CELLS / f"{plan.table}-{problem}-{name}-{seed}.json"
             cell = _read(path) if path.is_file() else None
-            if cell is None or cell.key != _key(plan, name):
+            if cell is None or cell.key != _key(plan, problem, name, seed):
                 cell = make(plan, problem, name, seed)
                 store.write_json(path, asdict(cell))
             cells.append(cell)
@@ -175,14 +179,18 @@ def finished(out: str | Path, table: str) -> list[Cell]:
 
 def make(plan: Plan, problem: str, name: str, seed: int) -> Cell:
     """One cell, from nothing."""
-    way, ocp, start = TABLES[plan.table].ways[name], load_ocp(problem), time.perf_counter()
+    way, ocp, shipped = TABLES[plan.table].ways[name], load_ocp(problem), _is_shipped(plan, name, seed)
     assert way.make is not None
-    model = _identified(ocp, seed, plan) if way.learned else None
-    identify, start, cpu = time.perf_counter() - start if way.learned else 0.0, time.perf_counter(), time.process_time()
-    made = way.make(Task(ocp, model, seed, plan))
+    start = time.perf_counter()
+    model = _identified(ocp, seed, plan) if way.learned and not shipped else None
+    identify = 0.0 if model is None else time.perf_counter() - start
+    start, cpu, task = time.perf_counter(), time.process_time(), Task(ocp, model, seed, plan)
+    made = _shipped(task, way.learned) if shipped else way.make(task)
     seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
-    cell = Cell(problem, name, seed, _key(plan, name), made.made, [], [], [], seconds, cpu, identify, made.evaluations,
-                math.nan, [])
+    if made.seconds is not None:
+        seconds, cpu = made.seconds, math.nan
+    cell = Cell(problem, name, seed, _key(plan, problem, name, seed), made.made, [], [], [], seconds, cpu, identify,
+                made.evaluations, math.nan, [])
     if made.controller is None:
         return cell
     return _judged(cell, ocp, made.controller, ocp.initial_states.sample(plan.states(way), HIDDEN + seed))
@@ -238,6 +246,19 @@ def _default(task: Task) -> Made:
     cnd = train(task.ocp, task.model, seed=task.seed, settings=settings, progress=False)
     rounds = f"u(x, t), {len(cnd.card['history'])} regressions" + (", and V" if cnd.value_net is not None else "")
     return Made(cnd, rounds, cnd.card["dynamics_evaluations"])
+
+
+def _is_shipped(plan: Plan, name: str, seed: int) -> bool:
+    return plan.shipped and seed == 0 and name in DEFAULTS
+
+
+def _shipped(task: Task, learned: bool) -> Made:
+    """nocl's default as it comes with nocl, made by the same call with seed 0."""
+    from nocl.solvers.cnd import pretrained
+
+    card = (cnd := pretrained(task.ocp.system.name, "learned" if learned else "exact")).card
+    return Made(cnd, "u(x, t) and V, as it ships with nocl", card.get("dynamics_evaluations", math.nan),
+                float(card["seconds"]))
 
 
 def _no_control_cost(make: Callable[[Task], Made], task: Task) -> Made:
@@ -305,11 +326,15 @@ TABLES = {"gym": GYM, "quadrotor": QUADROTOR}
 QUICK = {"n": 8, "seeds": 1, "iterations": 10, "oc_iterations": 20, "oc_batch": 16}
 
 
-def _key(plan: Plan, name: str) -> dict[str, Any]:
+def _key(plan: Plan, problem: str, name: str, seed: int) -> dict[str, Any]:
     way = TABLES[plan.table].ways[name]
     key: dict[str, Any] = {"n": plan.states(way), "quick": plan.quick}
     if name.endswith(("paper", "paper-learned")):
         key["iterations"] = plan.iterations
+    if _is_shipped(plan, name, seed):
+        from nocl.solvers.cnd import pretrained
+
+        key["controller"] = fingerprint(pretrained(problem, "learned" if way.learned else "exact").to_casadi())
     if name == "neural-oc":
         key |= {"iterations": plan.oc_iterations, "batch": plan.oc_batch}
     return key

@@ -59,7 +59,7 @@ def markdown(entries: Sequence[Entry], name: str) -> str:
     lines = [f"| {' | '.join(HEAD)} |", f"|{'---|' * len(HEAD)}"]
     for e in entries:
         way, paper = _way(e, name)
-        took = "" if not e.seeds or not e.cpu >= 0 else f"{_number(e.seconds)} ({_number(e.cpu)})"
+        took = _number(e.seconds) + (f" ({_number(e.cpu)})" if math.isfinite(e.cpu) else "")
         theirs = ["", "", ""] if paper is None else [
             _pair(paper.error, paper.error_std), _pair(paper.magnitude, paper.magnitude_std),
             "" if paper.evaluations is None else f"{paper.evaluations}"]
