@@ -131,7 +131,7 @@ def _add_tables(sub: argparse.ArgumentParser) -> None:
     one.add_argument("--n", type=_count, help="initial states; default: 1000, with --quick 20")
     one.add_argument("--iterations", type=_count, metavar="N",
                      help="of Adam in the paper's method; default: 1000, with --quick 20")
-    one.add_argument("--grid", type=_grid, metavar="A,B,C", help="nodes of the level sets; default: 46,73,81")
+    one.add_argument("--grid", type=_grid, metavar="A,B,C", help="nodes of the level sets; default: 41,81,81")
     one.add_argument("--ways", type=_words, metavar="A,B", help="rows, like rrt-100,cnd; default: all eight")
     _add_control(table("gym", _reproduce_control, "acrobot and cart-pole by learned dynamics: CND, NMPC"))
     one = table("quadrotor", _reproduce_control, "the quadrotor, f known and not: CND, NeuralOC, NMPC, LQR")
@@ -211,7 +211,7 @@ def _grid(text: str) -> tuple[int, ...]:
     try:
         return tuple(int(part) for part in text.split(","))
     except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r}; expected numbers of nodes, like 46,73,81") from None
+        raise argparse.ArgumentTypeError(f"{text!r}; expected numbers of nodes, like 41,81,81") from None
 
 
 def _words(text: str) -> tuple[str, ...]:

@@ -2,10 +2,10 @@
 
     V_t + min_{u in U} (L(x, u) + V_x' f(x, u)) = 0,   V(x, T) = G(x),
 
-solved backwards in time: one-sided derivatives by WENO, Lax-Friedrichs dissipation with max_u |f_i(x, u)| at each node,
-TVD Runge-Kutta under the CFL condition. Path constraints enter as the OCP's penalty (OCP.L_soft). V is right where
-optimal trajectories stay inside the box: beyond its edges V is taken to rise, so that leaving never pays. Give the box
-a margin, and put the goal on a node: V's narrowest valleys end there.
+solved backwards in time: one-sided differences by WENO, each control judged by those on the side that it drives to, TVD
+Runge-Kutta under the CFL condition (levelset_scheme.py). Path constraints enter as the OCP's penalty (OCP.L_soft). V is
+right where optimal trajectories stay inside the box: beyond its edges V is taken to rise, so that leaving never pays.
+Give the box a margin. V's narrowest valleys end at the goal: put it on a node, or let `stretch` do it, and more.
 
 Sources: Osher and Shu, High-order essentially nonoscillatory schemes for Hamilton-Jacobi equations, SIAM J. Numer.
 Anal. 28 (1991); Jiang and Peng, Weighted ENO schemes for Hamilton-Jacobi equations, SIAM J. Sci. Comput. 21 (2000).
@@ -31,7 +31,7 @@ from tqdm import tqdm
 
 from nocl import checks, store
 from nocl.checks import Array
-from nocl.hamiltonian import hamiltonian, minimiser
+from nocl.hamiltonian import minimiser
 from nocl.ocp import OCP
 
 try:
@@ -39,18 +39,23 @@ try:
     import jax
     import jax.numpy as jnp
 
+    from nocl.solvers.levelset_scheme import (
+        INTEGRATORS,
+        Dynamics,
+        axis,
+        eased,
+        exact_minimiser,
+        lattice,
+        sampled_minimiser,
+    )
     from nocl.to_jax import to_jax
 except ImportError as error:
     raise ImportError(f"level sets need hj-reachability and JAX ({error}): pip install 'nocl[levelset]'") from error
 
 SCHEMES = {"first": ("first_order", 1), "weno3": ("WENO3", 3), "weno5": ("WENO5", 3)}  # derivative; Runge-Kutta order
-INTEGRATORS = {1: hj.time_integration.first_order_total_variation_diminishing_runge_kutta,
-               3: hj.time_integration.third_order_total_variation_diminishing_runge_kutta}
 PERIOD = 2 * math.pi
 SMALLEST = 8  # nodes along an axis
 EARLY = 1.5  # the k-th of n slices stands (k / n)^EARLY of the horizon before its end, where V changes fastest
-REFINEMENTS = 12  # halvings of the search for a sampled minimum
-SAFETY = 1.05  # on max |f_i| that was found by sampling
 
 
 @dataclass(frozen=True)
@@ -73,6 +78,13 @@ class LevelSet:
     box : (lower [nx], upper [nx])
         Default: the system's box [lbx, ubx]. An axis is periodic where it is a declared angle, f, L and G have the
         period 2 pi in it, and the box covers a period: it then spans [lower, lower + 2 pi).
+    stretch : [nx]
+        Width s of the region round the goal in which cells are narrow, for each state: nodes stand at
+        x_goal + s sinh(y), y uniform. inf, the default: uniform in x. The box may grow by up to a cell, so that the
+        goal is a node.
+    penalty_slope : float
+        Path constraints' penalties rise no steeper than this with depth (`eased`): what rises by far more than V within
+        a cell is smeared. V is then nowhere too high for it, and right where optima keep as far out as before.
     scheme : "weno3", "weno5" or "first" (order)
     slices : times at which V is kept, denser towards the end
     samples : values of each control that are tried where H is not quadratic in u, refined by bisection from the best
@@ -81,8 +93,9 @@ class LevelSet:
     """
 
     def __init__(self, ocp: OCP, grid: Sequence[int], *, box: tuple[ArrayLike, ArrayLike] | None = None,
-                 scheme: str = "weno3", slices: int = 41, cfl: float = 0.75, samples: int = 9,
-                 max_memory: float = 4.0, max_seconds: float = 600.0) -> None:
+                 stretch: ArrayLike | None = None, penalty_slope: float = math.inf, scheme: str = "weno3",
+                 slices: int = 41, cfl: float = 0.75, samples: int = 9, max_memory: float = 4.0,
+                 max_seconds: float = 600.0) -> None:
         checks.problem(ocp, "LevelSet")
         owner = f"LevelSet of {ocp.system.name!r}"
         self.ocp, self.grid = ocp, _checked_grid(grid, ocp.system.nx, owner)
@@ -100,8 +113,17 @@ class LevelSet:
                                           ocp.system.state_names)
         self.periodic = periodic_axes(ocp, self.lower, upper)
         self.upper = np.where(self.periodic, self.lower + PERIOD, upper)
+        self.stretch = self._checked_stretch(stretch, owner)
+        self.penalty_slope = math.inf if penalty_slope == math.inf else checks.number(
+            penalty_slope, "penalty_slope", owner, positive=True)
         self.t = ocp.horizon * (1 - (np.arange(slices)[::-1] / (slices - 1)) ** EARLY)
-        self.minimise = _exact(ocp) or _sampled(ocp, samples)
+        self.solved = ocp if self.penalty_slope == math.inf else eased(ocp, self.penalty_slope)
+        self.minimise = exact_minimiser(self.solved) or sampled_minimiser(self.solved, samples)
+        goal = np.asarray(ocp.x_goal, dtype=float).ravel()
+        self.lattice = tuple(axis(*row) for row in zip(self.lower, self.upper, self.grid, goal, self.stretch,
+                                                       self.periodic, strict=True))
+        self.lower = np.array([a.nodes[0] for a in self.lattice])
+        self.upper = np.where(self.periodic, self.upper, [a.nodes[-1] for a in self.lattice])
 
     @property
     def exact(self) -> bool:
@@ -111,8 +133,7 @@ class LevelSet:
     @property
     def axes(self) -> tuple[Array, ...]:
         """The nodes along each state."""
-        return tuple(np.linspace(low, high, n, endpoint=not periodic) for low, high, n, periodic
-                     in zip(self.lower, self.upper, self.grid, self.periodic, strict=True))
+        return tuple(a.nodes for a in self.lattice)
 
     def predict(self) -> Prediction:
         """Memory, steps and seconds, by compiling the solver and timing one step; ValueError above a limit."""
@@ -137,19 +158,19 @@ class LevelSet:
 
     def _ready(self) -> tuple[Callable[..., Any], Any, Prediction]:
         """(advance(t, V, t') -> V at t', V at the horizon, what it will take)."""
-        settings, dynamics = self._settings(), _Dynamics(self.ocp, self.minimise, self.samples)
-        lattice = jax.eval_shape(self._lattice)
+        settings = self._settings()
+        dynamics = Dynamics(self.solved, self.minimise, self.lattice, self.samples)
+        shapes = jax.eval_shape(self._lattice)
         number = jax.ShapeDtypeStruct((), np.float64)
         values = jax.ShapeDtypeStruct(self.grid, np.float64)
-        step = hj.step.lower(settings, dynamics, lattice, number, values, number, progress_bar=False).compile()
+        step = hj.step.lower(settings, dynamics, shapes, number, values, number, progress_bar=False).compile()
         memory = self._memory(step)
         if memory > self.max_memory:
             self._refuse(f"max_memory = {self.max_memory:g} GB", f"{memory:.3g} GB", memory / self.max_memory,
                          len(self.grid))
         nodes = self._lattice()
         V = to_jax(self.ocp.G)(nodes.states)[..., 0]
-        speed = jnp.sum(dynamics.speeds(nodes.states) / jnp.array(nodes.spacings), -1)
-        dt = min(self.cfl / float(jnp.max(speed)), self.ocp.horizon)
+        dt = min(self.cfl / float(dynamics.rate(nodes.states)), self.ocp.horizon)
 
         def advance(t: float, V: Any, target: float) -> Any:
             return step(settings, nodes, jnp.float64(t), V, jnp.float64(target)).block_until_ready()
@@ -167,9 +188,22 @@ class LevelSet:
                                  time_integrator=INTEGRATORS[order], CFL_number=self.cfl)
 
     def _lattice(self) -> Any:
-        edges = tuple(hj.boundary_conditions.periodic if p else _rising for p in self.periodic)
-        return hj.Grid.from_lattice_parameters_and_boundary_conditions(
-            hj.sets.Box(jnp.asarray(self.lower), jnp.asarray(self.upper)), self.grid, boundary_conditions=edges)
+        return lattice(self.lattice, self.periodic)
+
+    def _checked_stretch(self, stretch: ArrayLike | None, owner: str) -> Array:
+        nx = self.ocp.system.nx
+        widths = np.full(nx, np.inf) if stretch is None else np.asarray(stretch, dtype=float)
+        if widths.shape != (nx,) or not (widths > 0).all():
+            raise ValueError(f"{owner}: stretch is {stretch!r}; expected {nx} widths > 0, inf for a uniform axis")
+        goal = np.asarray(self.ocp.x_goal, dtype=float).ravel()
+        for i in np.flatnonzero(np.isfinite(widths)):
+            name = self.ocp.system.state_names[i]
+            if self.periodic[i]:
+                raise ValueError(f"{owner}: stretch[{i}] is {widths[i]:g} and {name} is periodic; expected inf there")
+            if not self.lower[i] <= goal[i] <= self.upper[i]:
+                raise ValueError(f"{owner}: stretch[{i}] is {widths[i]:g} and the goal {goal[i]:g} lies outside the "
+                                 f"box along {name}; expected inf there, or a box round the goal")
+        return widths
 
     def _memory(self, step: Any) -> float:
         """GB: XLA's own account of a step, the slices in float32, and the two splines in use with their making."""
@@ -323,108 +357,6 @@ def periodic_axes(ocp: OCP, lower: Array, upper: Array) -> Array:
     return found
 
 
-class _Dynamics(hj.dynamics.Dynamics):
-    """What hj-reachability asks of a problem, state by state (it maps over the grid)."""
-
-    def __init__(self, ocp: OCP, minimise: _Minimiser, samples: int) -> None:
-        self.minimise, self.f = minimise, to_jax(ocp.system.f)
-        self.controls, self.safety = _extremes(ocp, samples)
-
-    def __call__(self, state: Any, control: Any, disturbance: Any, time: Any) -> Any:
-        return self.f(state, control)
-
-    def optimal_control_and_disturbance(self, state: Any, time: Any, grad_value: Any) -> Any:
-        return self.minimise.traced(state, grad_value)[0], None
-
-    def hamiltonian(self, state: Any, time: Any, value: Any, grad_value: Any) -> Any:
-        return self.minimise.traced(state, grad_value)[1]
-
-    def partial_max_magnitudes(self, state: Any, time: Any, value: Any, grad_value_box: Any) -> Any:
-        return self.speeds(state)
-
-    def speeds(self, states: Any) -> Any:
-        """max_u |f_i(x, u)| [..., nx]."""
-        fastest = jnp.zeros_like(states)
-        for u in self.controls:
-            fastest = jnp.maximum(fastest, jnp.abs(self.f(states, jnp.broadcast_to(u, (*states.shape[:-1], len(u))))))
-        return self.safety * fastest
-
-
-def _rising(V: Any, width: int) -> Any:
-    """V along an axis with `width` more nodes at both ends, rising outwards with the slope at the end, up or down.
-
-    Extrapolated as it is, a V that falls towards an edge falls beyond it without end: below 0, and then inside too.
-    """
-    k = jnp.arange(1, width + 1)
-    return jnp.concatenate([V[0] + jnp.abs(V[1] - V[0]) * k[::-1], V, V[-1] + jnp.abs(V[-1] - V[-2]) * k])
-
-
-def _extremes(ocp: OCP, samples: int) -> tuple[Array, float]:
-    """Controls among which |f_i| is largest, and a safety factor: U's corners, exact where f is affine in each u_i."""
-    s = ocp.system
-    bent = [ca.jacobian(ca.jacobian(s.equations, s.u[i]), s.u[i]).nnz() for i in range(s.nu)]
-    n, safety = (samples, SAFETY) if any(bent) else (2, 1.0)
-    ends = [np.linspace(low, high, n) for low, high in zip(s.lbu, s.ubu, strict=True)]
-    return np.array(list(itertools.product(*ends))), safety
-
-
-@dataclass(frozen=True, eq=False)
-class _Minimiser:
-    """argmin_u H: `traced` on JAX arrays, (x [..., nx], p) -> (u [..., nu], H [...]); `rows` on numpy's, -> u."""
-
-    traced: Callable[[Any, Any], tuple[Any, Any]]
-    rows: Callable[[Array, Array], Array]
-
-
-def _exact(ocp: OCP) -> _Minimiser | None:
-    """In closed form, or None."""
-    best = minimiser(ocp)
-    if best is None:
-        return None
-    translated = to_jax(best)
-
-    def traced(x: Any, p: Any) -> tuple[Any, Any]:
-        u, H = translated(x, p)
-        return u, H[..., 0]
-
-    return _Minimiser(traced, lambda x, p: np.asarray(best(x.T, p.T)[0].full().T, dtype=np.float64))
-
-
-def _sampled(ocp: OCP, samples: int) -> _Minimiser:
-    """The best of samples^nu controls, then of the 3^nu round it, REFINEMENTS times at half the distance."""
-    H, s = to_jax(hamiltonian(ocp)), ocp.system
-    lb, ub = np.asarray(s.lbu), np.asarray(s.ubu)
-    first = np.array(list(itertools.product(np.linspace(0.0, 1.0, samples), repeat=s.nu))) * (ub - lb) + lb
-    around = np.array(list(itertools.product((-1.0, 0.0, 1.0), repeat=s.nu)))
-
-    def traced(x: Any, p: Any) -> tuple[Any, Any]:
-        batch = x.shape[:-1]
-
-        def better(u: Any, best: tuple[Any, Any]) -> tuple[Any, Any]:
-            value = H(x, u, p)[..., 0]
-            return jnp.where((value < best[1])[..., None], u, best[0]), jnp.minimum(value, best[1])
-
-        def sample(k: Any, best: tuple[Any, Any]) -> tuple[Any, Any]:
-            return better(jnp.broadcast_to(jnp.asarray(first)[k], (*batch, s.nu)), best)
-
-        def closer(k: Any, best: tuple[Any, Any]) -> tuple[Any, Any]:
-            centre, width = best[0], (ub - lb) / (samples - 1) * 0.5 ** (k + 1)
-            for direction in around:
-                best = better(jnp.clip(centre + direction * width, lb, ub), best)
-            return best
-
-        nothing = jnp.zeros((*batch, s.nu)), jnp.full(batch, jnp.inf)
-        return jax.lax.fori_loop(0, REFINEMENTS, closer, jax.lax.fori_loop(0, len(first), sample, nothing))
-
-    compiled = jax.jit(traced)
-
-    def rows(x: Array, p: Array) -> Array:
-        with jax.enable_x64(True):
-            return np.asarray(compiled(x, p)[0], dtype=np.float64)
-
-    return _Minimiser(traced, rows)
-
-
 def _checked_grid(grid: Sequence[int], nx: int, owner: str) -> tuple[int, ...]:
     if nx > 4:
         raise ValueError(f"{owner}: the problem has {nx} states; expected at most 3 (4 with a warning), since a grid "
@@ -465,4 +397,5 @@ def _timed(call: Callable[[], Any]) -> float:
 def _fingerprint(problem: LevelSet) -> dict[str, Any]:
     return {"ocp": problem.ocp.to_data(), "grid": list(problem.grid), "lower": problem.lower.tolist(),
             "upper": problem.upper.tolist(), "scheme": problem.scheme, "t": problem.t.tolist(), "cfl": problem.cfl,
-            "samples": problem.samples}
+            "samples": problem.samples,
+            "stretch": [str(w) for w in problem.stretch], "penalty_slope": str(problem.penalty_slope)}

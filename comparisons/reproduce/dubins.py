@@ -31,7 +31,9 @@ TOLERANCE = 0.1
 INTERVALS = 80
 NODES = 401  # at which continuous feedback is recorded, to measure lengths
 DRAWN = 12  # trajectories that a cell keeps for the figure
-BOX = ([-3.9, -3.6, -4.0], [0.6, 3.6, 4.0])  # of the level sets
+BOX = ([-4.05, -3.9, -4.0], [0.45, 3.9, 4.0])  # of the level sets
+STRETCH = (0.5, 0.5, 0.7)  # their cells are narrow near the goal
+PENALTY_SLOPE = 0.03  # of the obstacle's penalty there, a second and m; at 0.01 to 0.02 a shortcut would begin to pay
 CELLS = "cells"
 Made = tuple[Any, float, str]  # (controller or controls, ms a state, how it was made)
 
@@ -42,7 +44,7 @@ class Plan:
 
     n: int = 1000
     seeds: int = 1
-    grid: tuple[int, ...] = (46, 73, 81)
+    grid: tuple[int, ...] = (41, 81, 81)
     paper_iterations: int = 1000  # of Adam, of the paper's method
     quick: bool = False
     ways: tuple[str, ...] = ()  # default: all
@@ -109,7 +111,7 @@ def finished(out: str | Path) -> list[Cell]:
 def make(way: str, seed: int, plan: Plan, folder: Path) -> Cell:
     """One cell, from nothing."""
     ocp = load_ocp("dubins")
-    x0 = ocp.initial_states.sample(plan.n, 1 + seed)
+    x0 = ocp.initial_states.sample(_states(way, plan), 1 + seed)
     controller, ms, made = WAYS[way].make(ocp, x0, seed, plan, folder)
     s, length = judged(ocp, controller, x0)
     turned = s.x[:, -1] - ocp.x_goal
@@ -182,7 +184,9 @@ def _optimum(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
 def _level_sets(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
     from nocl.solvers.levelset import LevelSet, LevelSetSolution
 
-    problem, path = LevelSet(ocp, plan.grid, box=BOX, max_seconds=3600.0), folder / CELLS / "dubins-V.safetensors"
+    path = folder / CELLS / "dubins-V.safetensors"
+    problem = LevelSet(ocp, plan.grid, box=BOX, stretch=STRETCH, penalty_slope=PENALTY_SLOPE, scheme="weno5",
+                       max_seconds=3600.0)
     try:
         solution = LevelSetSolution.load(path, problem)
     except ValueError:  # none yet, or of another grid
@@ -215,16 +219,17 @@ def _paper(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
 
 @dataclass(frozen=True)
 class Way:
-    """A row of the table; `paper`: mean length, its s.d., seconds, success rate."""
+    """A row of the table; `paper`: mean length, its s.d., seconds, success rate; `most`: states, where it is slow."""
 
     title: str
     make: Callable[..., Made]
     paper: tuple[float, float, float, float] | None = None
+    most: int | None = None
 
 
 WAYS = {"rrt-100": Way("RRT* (iter: 100)", _rrt(100), (4.8871, 0.9607, 6.9313, 0.889)),
         "rrt-200": Way("RRT* (iter: 200)", _rrt(200), (4.7343, 0.8451, 26.0595, 0.939)),
-        "nmpc": Way("NMPC", _nmpc), "level-sets": Way("HJB level sets", _level_sets),
+        "nmpc": Way("NMPC", _nmpc, most=200), "level-sets": Way("HJB level sets", _level_sets),
         "cnd-paper": Way("CND, the paper's method", _paper, (4.1076, 0.6916, 0.0634, 0.999)),
         "cnd": Way("CND, nocl's default, exact f", _pretrained("cnd")),
         "cnd-learned": Way("CND, nocl's default, learned f", _pretrained("cnd-learned")),
@@ -234,10 +239,15 @@ NEEDS = {"rrt-100": "ompl", "rrt-200": "ompl", "level-sets": "hj_reachability"}
 PLANS = {False: Plan(), True: Plan(n=20, grid=(24, 37, 41), paper_iterations=20, quick=True)}
 
 
+def _states(way: str, plan: Plan) -> int:
+    most = WAYS[way].most
+    return plan.n if most is None else min(plan.n, most)
+
+
 def _key(way: str, plan: Plan) -> dict[str, Any]:
-    key: dict[str, Any] = {"n": plan.n}
+    key: dict[str, Any] = {"n": _states(way, plan)}
     if way == "level-sets":
-        key["grid"] = list(plan.grid)
+        key |= {"grid": list(plan.grid), "stretch": list(STRETCH), "penalty_slope": PENALTY_SLOPE}
     if way == "cnd-paper":
         key["iterations"] = plan.paper_iterations
     if way in SHIPPED:
@@ -265,6 +275,7 @@ class Entry:
     length: float
     length_std: float
     success: float
+    collisions: int
     ms: float
     cost: float
     gap: float  # per cent, median of (J - J*) / J* over states where both succeed; NaN without the optimum
@@ -282,7 +293,9 @@ def table(cells: Sequence[Cell]) -> list[Entry]:
 
 def _entry(cells: Sequence[Cell], best: dict[int, Cell]) -> Entry:
     ok = np.concatenate([c.success for c in cells])
-    length, cost = (np.concatenate([getattr(c, name) for c in cells]) for name in ("length", "cost"))
+    length, cost, clear = (np.concatenate([getattr(c, name) for c in cells])
+                           for name in ("length", "cost", "clearance"))
+    hits = int((clear < -VIOLATION).sum())
     gap = ratio = math.nan
     if all(c.seed in best and len(best[c.seed].cost) >= len(c.cost) for c in cells):  # same seed, same first states
         same = [(best[c.seed], slice(len(c.cost))) for c in cells]
@@ -293,5 +306,5 @@ def _entry(cells: Sequence[Cell], best: dict[int, Cell]) -> Entry:
             ratio = float(length[both].mean() / short[both].mean())
     mean, std, J = (float(length[ok].mean()), float(length[ok].std()), float(cost[ok].mean())) if ok.any() else \
         (math.nan, math.nan, math.nan)
-    return Entry(cells[0].way, mean, std, float(ok.mean()), float(np.mean([c.ms for c in cells])), J, gap, ratio,
+    return Entry(cells[0].way, mean, std, float(ok.mean()), hits, float(np.mean([c.ms for c in cells])), J, gap, ratio,
                  len(cells[0].cost), len(cells), cells[0].made)
