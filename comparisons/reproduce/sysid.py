@@ -21,6 +21,7 @@ from nocl.systems import load_ocp
 
 SYSTEMS = ("dubins", "acrobot", "cartpole", "quadrotor")
 HELD_OUT, HELD_OUT_SEED = 10_000, 1_000_003
+WIDTH = {"quadrotor": 128}  # of the paper's networks, where PaperSettings' default is too narrow to learn f at all
 QUICK = Settings(iterations=150, polish=8, samples=20_000)
 CELLS = "cells"  # the folder of finished cells
 
@@ -35,11 +36,12 @@ class Way:
     gradients: bool
     activation: str = "sine"
 
-    def settings(self, plan: Plan) -> PaperSettings | Settings | None:
-        """Its budgets; None: those of `identify`."""
+    def settings(self, plan: Plan, system: str) -> PaperSettings | Settings | None:
+        """Its budgets on a system; None: those of `identify`."""
         if self.method == "paper":
             samples = QUICK.samples if plan.quick else PaperSettings.samples
-            return PaperSettings(activation=self.activation, iterations=plan.iterations, samples=samples)
+            return PaperSettings(activation=self.activation, iterations=plan.iterations, samples=samples,
+                                 width=WIDTH.get(system, PaperSettings.width))
         return QUICK if plan.quick else None
 
 
@@ -121,14 +123,14 @@ def run(out: str | Path, plan: Plan | None = None, *, progress: bool = True) -> 
 
 
 def _make(system: System, way: Way, seed: int, plan: Plan) -> Cell:
-    model = identify(system, method=way.method, gradients=way.gradients, seed=seed, settings=way.settings(plan),
+    model = identify(system, method=way.method, gradients=way.gradients, seed=seed, settings=way.settings(plan, system.name),
                      progress=False)
     score = model.score(HELD_OUT, HELD_OUT_SEED + seed)  # samples that no network was trained on
-    return Cell(system.name, way.name, seed, score, model.card["seconds"], model.card["labels"], _key(way, plan))
+    return Cell(system.name, way.name, seed, score, model.card["seconds"], model.card["labels"], _key(way, plan, system.name))
 
 
-def _key(way: Way, plan: Plan) -> dict[str, Any]:
-    settings = way.settings(plan)
+def _key(way: Way, plan: Plan, system: str) -> dict[str, Any]:
+    settings = way.settings(plan, system)
     return {} if settings is None else asdict(settings)
 
 
@@ -141,7 +143,7 @@ def _finished(folder: Path, system: str, way: Way, seed: int, plan: Plan) -> Cel
     if not path.is_file():
         return None
     cell = _read(path)
-    return cell if cell.settings == _key(way, plan) else None
+    return cell if cell.settings == _key(way, plan, system) else None
 
 
 def _read(path: Path) -> Cell:
@@ -195,8 +197,8 @@ def table(cells: Sequence[Cell]) -> dict[tuple[str, str], Entry]:
 
 
 def _dearest(cells: Sequence[Cell]) -> list[Cell]:
-    """The cells made like the one with the most samples and iterations."""
-    most = max((c.settings for c in cells), key=lambda s: (s.get("samples", 0), s.get("iterations", 0)))
+    """The cells made like the one with the most samples and iterations, and the widest network."""
+    most = max((c.settings for c in cells), key=lambda s: [s.get(name, 0) for name in ("samples", "iterations", "width")])
     return [c for c in cells if c.settings == most]
 
 
