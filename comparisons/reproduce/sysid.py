@@ -123,10 +123,11 @@ def run(out: str | Path, plan: Plan | None = None, *, progress: bool = True) -> 
 
 
 def _make(system: System, way: Way, seed: int, plan: Plan) -> Cell:
-    model = identify(system, method=way.method, gradients=way.gradients, seed=seed, settings=way.settings(plan, system.name),
-                     progress=False)
+    model = identify(system, method=way.method, gradients=way.gradients, seed=seed, progress=False,
+                     settings=way.settings(plan, system.name))
     score = model.score(HELD_OUT, HELD_OUT_SEED + seed)  # samples that no network was trained on
-    return Cell(system.name, way.name, seed, score, model.card["seconds"], model.card["labels"], _key(way, plan, system.name))
+    return Cell(system.name, way.name, seed, score, model.card["seconds"], model.card["labels"],
+                _key(way, plan, system.name))
 
 
 def _key(way: Way, plan: Plan, system: str) -> dict[str, Any]:
@@ -198,7 +199,8 @@ def table(cells: Sequence[Cell]) -> dict[tuple[str, str], Entry]:
 
 def _dearest(cells: Sequence[Cell]) -> list[Cell]:
     """The cells made like the one with the most samples and iterations, and the widest network."""
-    most = max((c.settings for c in cells), key=lambda s: [s.get(name, 0) for name in ("samples", "iterations", "width")])
+    budgets = ("samples", "iterations", "width")
+    most = max((c.settings for c in cells), key=lambda s: [s.get(name, 0) for name in budgets])
     return [c for c in cells if c.settings == most]
 
 
