@@ -47,9 +47,36 @@ def test_a_feedback_is_rolled_out_for_all_states_at_once():
     assert asked == [2] * (dubins.INTERVALS + 1)
 
 
+def test_both_sides_and_both_turning_directions_are_taken_each_where_it_is_better():
+    """The shipped controller on states and their mirror images: mirrored paths, each at the cost of the best one."""
+    from nocl.simulate import simulate
+    from nocl.solvers.ddp import DDP
+
+    ocp, mirror = nocl.load_ocp("dubins"), np.array([1.0, -1.0, -1.0])
+    x0 = np.array([[-3.0, 1.0, 1.5], [-2.8, 2.0, -2.5], [-3.2, 0.6, 2.6], [-3.0, 2.0, 0.5]])
+    run = simulate(ocp, nocl.pretrained("dubins", "exact"), np.concatenate([x0, x0 * mirror]), nodes=401)
+    above = np.array([np.interp(-1.0, x[:, 0], x[:, 1]) for x in run.x]) > 0  # where px passes the obstacle's centre
+    left = run.u[:, :40, 1].sum(axis=1) > 0  # the first 0.8 s
+    n = len(x0)
+    assert (above[:n] != above[n:]).all()
+    assert (left[:n] != left[n:]).all()
+    assert len({(bool(a), bool(b)) for a, b in zip(above, left, strict=True)}) == 4
+    held = run.u[:, :-1].reshape(2 * n, 80, 5, 2).mean(axis=2)
+    starts = [held, held * [1.0, -1.0], np.roll(held, n, axis=0), np.roll(held, n, axis=0) * [1.0, -1.0]]
+    best = np.min([DDP(ocp).solve(np.concatenate([x0, x0 * mirror]), u=u).cost for u in starts], axis=0)
+    assert (run.cost < 1.02 * best).all()
+
+
 def test_success_needs_the_goal_and_the_obstacle():
     made = cell("cnd", [4.0] * 3, [1.0] * 3, [0.05, 0.2, 0.05], [0.1, 0.1, -0.01])
     assert made.success.tolist() == [True, False, False]
+    assert dubins.table([made])[0].collisions == 1
+
+
+def test_slow_ways_have_fewer_states():
+    assert dubins._key("nmpc", dubins.Plan())["n"] == dubins.WAYS["nmpc"].most
+    assert dubins._key("nmpc", dubins.Plan(n=20))["n"] == 20
+    assert dubins._key("optimum", dubins.Plan())["n"] == 1000
 
 
 def test_the_table_compares_with_the_optimum_of_the_same_states():
@@ -57,6 +84,7 @@ def test_the_table_compares_with_the_optimum_of_the_same_states():
     assert list(entries) == ["cnd", "optimum"]
     assert entries["cnd"].success == pytest.approx(2 / 3)
     assert entries["cnd"].length == pytest.approx(4.3)
+    assert entries["cnd"].collisions == 0
     assert entries["cnd"].gap == pytest.approx(7.5)
     assert entries["cnd"].ratio == pytest.approx(4.3 / 4.0)
     assert entries["optimum"].gap == pytest.approx(0.0)
