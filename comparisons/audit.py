@@ -32,24 +32,27 @@ def audit(report: Report, methods: Mapping[str, Any], model: Any = None) -> tupl
     """Audits of the methods of a report, by the names that they were compared under; others are left out.
 
     model: the dynamics that the controls were made on, a casadi.Function (x, u) -> xdot or an object with
-    `to_casadi()`; without one the rollouts on it are missing.
+    `to_casadi()`; without one the rollouts on it are missing. Where it has `doubt(x, u)` (learned dynamics, ensembles),
+    what it says of the judged runs stands beside.
     """
     from nocl.threads import one_thread  # with torch
 
     learned = None if model is None else dynamics_function(report.ocp, model)
     with one_thread():
-        return tuple(_audit(report, judged, methods[judged.name], learned) for judged in report.judged
-                     if judged.name in methods)
+        return tuple(_audit(report, judged, methods[judged.name], learned, getattr(model, "doubt", None))
+                     for judged in report.judged if judged.name in methods)
 
 
-def _audit(report: Report, judged: Judged, method: Any, learned: ca.Function | None) -> MethodAudit:
+def _audit(report: Report, judged: Judged, method: Any, learned: ca.Function | None,
+           doubt: Callable[[Array, Array], Array] | None) -> MethodAudit:
     plants = {EXACT: report.ocp.system.f} | ({} if learned is None else {LEARNED: learned})
     control = _control(report.ocp, judged, method)
     rollouts = () if control is None else tuple(
         _rollout(report.ocp, name, f, judged.simulation.t, report.x0, *control) for name, f in plants.items())
     cost = {r.name: r.cost for r in rollouts}
     return MethodAudit(judged.name, rollouts, _excess(judged, cost.get(LEARNED)), _excess(judged, cost.get(EXACT)),
-                       _value(report, judged, method))
+                       _value(report, judged, method),
+                       None if doubt is None else doubt(judged.simulation.x, judged.simulation.u))
 
 
 def _excess(judged: Judged, cost: Array | None) -> Array:

@@ -77,13 +77,24 @@ class MethodAudit:
     exploitation: Array  # [B], 100 (judged cost - cost on the learned model) / |judged cost|; NaN without a model
     discretisation: Array  # [B], 100 (judged cost - cost by RK4 on the exact f) / |judged cost|
     value: ValueAudit | None
+    doubt: Array | None = None  # [B], share of the judged run's nodes where the model says it is not to be trusted
 
     def rows(self) -> list[Row]:
         """One dict a state."""
+        doubt = np.full(len(self.exploitation), np.nan) if self.doubt is None else 100 * self.doubt
         value = self.value.rows() if self.value is not None else [{} for _ in self.exploitation]
         return [{**{f"cost, {r.name}": float(r.cost[i]) for r in self.rollouts},
-                 "exploitation": float(self.exploitation[i]), "discretisation": float(self.discretisation[i]), **more}
+                 "exploitation": float(self.exploitation[i]), "discretisation": float(self.discretisation[i]),
+                 "doubt": float(doubt[i]), **more}
                 for i, more in enumerate(value)]
+
+    @property
+    def sentence(self) -> str:
+        """Where the model is not to be trusted; "" where it does not know."""
+        if self.doubt is None:
+            return ""
+        return (f"{self.method}: the model is not to be trusted somewhere along {int((self.doubt > 0).sum())} of "
+                f"{len(self.doubt)} trajectories.")
 
     def summary(self) -> Row:
         """Quantiles of each number over the states."""

@@ -146,7 +146,7 @@ AUDITED = (("exploitation", "exploitation %"), ("discretisation", "discretisatio
            ("value_error", "|V - J|"), ("gradient_angle", "angle of grad V [deg]"),
            ("gradient_size", "size of grad V [%]"), ("path_gradient_angle", "angle along the path"),
            ("path_gradient_size", "size along the path"), ("hjb", "mean |HJB|"),
-           ("hamiltonian_gradient", "mean ||dH/du||"))
+           ("hamiltonian_gradient", "mean ||dH/du||"), ("doubt", "model doubtful % of nodes"))
 
 
 def audits(report: Report) -> Table:
@@ -156,7 +156,8 @@ def audits(report: Report) -> Table:
     body = [[row["method"], *(_spread(row.get(key, {})) for key, _ in shown)] for row in found]
     return Table("Audit: models, integrators and value functions", ["method", *(label for _, label in shown)], body,
                  "Median (95th percentile). Exploitation: what the judged cost exceeds the cost on the learned model "
-                 "by; discretisation: likewise RK4. grad V is held against a solver's costate.")
+                 "by; discretisation: likewise RK4. grad V is held against a solver's costate."
+                 + "".join(f" {audit.sentence}" for audit in report.audits if audit.sentence))
 
 
 def _spread(found: dict[str, float]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -97,3 +97,18 @@ class Coverage:
     def from_data(data: Mapping[str, Any]) -> Coverage:
         return Coverage(np.array(data["points"]), np.array(data["centre"]), np.array(data["scale"]),
                         tuple(data["angles"]), data["radius"], tuple(data["names"]))
+
+
+def share_of_nodes(marks: Callable[[Array, Array], Any], x: ArrayLike, u: ArrayLike) -> Array:
+    """The share of each trajectory's nodes x [B, K+1, nx], u [B, K or K+1, nu] that `marks` (rows -> [n] bool): [B].
+
+    NaN where a trajectory has no finite node.
+    """
+    u = np.asarray(u)
+    x = np.asarray(x)[:, : u.shape[1]]
+    there = np.isfinite(x).all(axis=2) & np.isfinite(u).all(axis=2)
+    marked = np.zeros(there.shape)
+    if there.any():
+        marked[there] = marks(x[there], u[there])
+    count = there.sum(axis=1)
+    return np.where(count > 0, marked.sum(axis=1) / np.maximum(count, 1), np.nan)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import casadi as ca
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
@@ -19,6 +20,7 @@ from torch import Tensor
 
 from nocl import checks, store
 from nocl.checks import Array
+from nocl.coverage import share_of_nodes
 from nocl.data import Dataset
 from nocl.logs import Log
 from nocl.sysid import LearnedDynamics, identify
@@ -76,18 +78,16 @@ class Ensemble:
         """
         return self.disagreement(x, u) > max(FACTOR * self.usual, 1e-9)
 
-    def doubt(self, x: Array, u: Array) -> Array:
+    def doubt(self, x: ArrayLike, u: ArrayLike) -> Array:
         """The share of each trajectory's nodes x [B, K+1, nx], u [B, K or K+1, nu] that is doubtful, for reports: [B].
 
         NaN where a trajectory has no finite node.
         """
-        x, u = np.asarray(x)[:, : u.shape[1]], np.asarray(u)
-        there = np.isfinite(x).all(axis=2) & np.isfinite(u).all(axis=2)
-        marked = np.zeros(there.shape)
-        if there.any():
-            marked[there] = self.doubtful(x[there], u[there])
-        count = there.sum(axis=1)
-        return np.where(count > 0, marked.sum(axis=1) / np.maximum(count, 1), np.nan)
+        return share_of_nodes(self.doubtful, x, u)
+
+    def to_casadi(self) -> ca.Function:
+        """The first member's, which controllers are trained on: f:(x, u)->(xdot)."""
+        return self.model.to_casadi()
 
     def save(self, folder: str | Path) -> Path:
         """Write folder/member-0, member-1, ... and ensemble.json, as data; returns the latter's path."""

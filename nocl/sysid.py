@@ -21,7 +21,8 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from nocl import checks, store, sysid_paper
-from nocl.coverage import Coverage
+from nocl.checks import Array
+from nocl.coverage import Coverage, share_of_nodes
 from nocl.data import Dataset
 from nocl.known import Known, Stated
 from nocl.logs import Log
@@ -95,6 +96,10 @@ class LearnedDynamics:
             warnings.warn(f"{outside.sum()} of {len(rows)} {what} lie outside the box X of {self.system.name!r}, which "
                           "the model was taught in: widen lbx, ubx", UserWarning, stacklevel=2)
         return outside
+
+    def doubt(self, x: ArrayLike, u: ArrayLike) -> Array:
+        """The share of each trajectory's states x [B, K+1, nx] (controls u for their number) that is `outside`: [B]."""
+        return share_of_nodes(lambda rows, _: self.outside(rows), x, u)
 
     def plot(self) -> Figure:
         """f_theta, and the exact f where it is known, along each variable through the middle of the box."""

@@ -54,6 +54,7 @@ def test_doubt_is_a_share_of_nodes(ensemble):
     x[0, 4] = np.nan
     doubt = ensemble.doubt(x, np.zeros((2, 5, 1)))
     assert doubt.tolist() == [0.0, 0.4]
+    assert ensemble.model.doubt(x, np.zeros((2, 5, 1))).tolist() == [0.0, 0.4]  # of a member alone: outside the box
     assert np.isnan(ensemble.doubt(np.full((1, 5, 2), np.nan), np.zeros((1, 4, 1)))).all()
 
 

@@ -17,6 +17,7 @@ from nocl.comparisons.reference import Reference, resolved
 from nocl.comparisons.region import grown, region
 from nocl.comparisons.robustness import Disturbances, mass_variants, on_plant, plant
 from nocl.comparisons.stability import local, stability
+from nocl.comparisons.tables import tables
 from nocl.solvers import LQR, NMPC
 from nocl.solvers.compiled import fingerprint
 from nocl.systems import double_integrator, dubins
@@ -84,6 +85,31 @@ def test_rollouts_on_a_model_show_what_is_gained_by_its_errors(ocp):
         assert one.exploitation.min() > 20
         assert np.abs(one.discretisation).max() < 1
         assert one.rollouts[0].x.shape == (2, len(one.rollouts[0].t), 2)
+
+
+def test_a_model_that_knows_where_not_to_trust_it_marks_trajectories(ocp):
+    """Doubtful where the speed is above 0.3: of the two states one flies through such speeds."""
+    class Doubting:
+        def to_casadi(self):
+            return ocp.system.f
+
+        def doubt(self, x, u):
+            assert u.shape[:2] == x.shape[:2]
+            return (np.abs(x[:, :, 1]) > 0.3).mean(axis=1)
+
+    report = compare(ocp, {"LQR": LQR(ocp)}, x0=[[0.02, 0.0], [1.0, 0.0]], progress=False)
+    report = dataclasses.replace(report, audits=audit(report, {"LQR": LQR(ocp)}, Doubting()))
+    one, = report.audits
+    fast = 100 * (np.abs(report.judged[0].simulation.x[:, :, 1]) > 0.3).mean(axis=1)
+    assert fast[0] == 0 < fast[1]
+    assert [row["doubt"] for row in report.rows()] == pytest.approx(fast.tolist())
+    assert one.sentence == "LQR: the model is not to be trusted somewhere along 1 of 2 trajectories."
+    table = tables(report)["audits"]
+    assert table.head[-1] == "model doubtful % of nodes"
+    assert one.sentence in table.note
+    silent, = audit(report, {"LQR": LQR(ocp)}, ocp.system.f)
+    assert silent.sentence == ""
+    assert np.isnan([row["doubt"] for row in silent.rows()]).all()
 
 
 def test_a_law_that_fails_on_one_state_is_audited_on_the_others(ocp):
