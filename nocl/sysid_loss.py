@@ -4,7 +4,8 @@ For a batch of B rows, with t_l = W_l a_{l-1} + b_l and a_l = s(t_l) in the hidd
 
     loss = mean_b |S (y - f)|_2 + mean_b |S_J * (J - df/dz)|_F,   J = W D_L W_L ... D_1 W_1,   D_l = diag s'(t_l)
 
-where S [nx] and, entry by entry, S_J [nx, nz] weigh residuals of normalised labels in physical units.
+or the same with squared norms. S [nx] and, entry by entry, S_J [nx, nz] weigh residuals: of normalised labels in
+physical units.
 
 J is built from the output down (a system has fewer equations than variables), its gradient from the input up. `Loss`
 does this for three layers as compiled C (csrc/paper_loss.h), for others in torch, to rounding the same. In torch, rows
@@ -59,16 +60,17 @@ class Loss:
     """The loss over given labels (tensors of one float type, float32 or float64) and its gradient, for one MLP.
 
     theta [P] are its weights, W_1, b_1, ..., W, b by rows in one vector; scale [nx, 1 + nz] is S beside S_J, ones if
-    None. `compiled`: in C, for three layers of weights; raises ValueError where there is no C compiler.
+    None; squared: norms are. `compiled`: in C, for three layers of weights; raises ValueError where there is no C
+    compiler.
     """
 
     def __init__(self, sizes: Sequence[int], activation: str, z: Tensor, f: Tensor, jacobian: Tensor | None, *,
-                 compiled: bool, scale: Tensor | None = None) -> None:
-        self.activation, self.labels = activation, (z, f, jacobian)
+                 compiled: bool, scale: Tensor | None = None, squared: bool = False) -> None:
+        self.activation, self.labels, self.squared = activation, (z, f, jacobian), squared
         self.scale = torch.ones(sizes[-1], 1 + sizes[0], dtype=z.dtype) if scale is None else scale.to(z.dtype)
         self._scale = torch.cat([self.scale[:, 0], self.scale[:, 1:].flatten()]).numpy()
         self.shapes = [s for n, m in pairwise(sizes) for s in ((m, n), (m,))]
-        self.kernel = Kernel(_source(sizes, activation, z.dtype)) if compiled else None
+        self.kernel = Kernel(_source(sizes, activation, z.dtype, squared)) if compiled else None
         self._arrays = [None if a is None else a.contiguous().numpy() for a in self.labels]
 
     def __call__(self, rows: Tensor, theta: Tensor, gradient: Tensor) -> float:
@@ -78,7 +80,8 @@ class Loss:
         z, f, jacobian = (None if a is None else a[rows] for a in self.labels)
         assert z is not None
         assert f is not None
-        value, parts = loss_and_gradient(self.weights(theta), self.activation, z, f, jacobian, self.scale)
+        value, parts = loss_and_gradient(self.weights(theta), self.activation, z, f, jacobian, self.scale,
+                                         self.squared)
         torch.cat([p.flatten() for p in parts], out=gradient)
         return value
 
@@ -97,30 +100,30 @@ class Loss:
         return [p.view(s) for p, s in zip(parts, self.shapes, strict=True)]
 
 
-def _source(sizes: Sequence[int], activation: str, dtype: torch.dtype) -> str:
+def _source(sizes: Sequence[int], activation: str, dtype: torch.dtype, squared: bool) -> str:
     if len(sizes) != 4 or sizes[1] != sizes[2]:
         raise ValueError(f"the compiled loss is for three layers and one width; got sizes {list(sizes)}")
     values = {"SINGLE": int(dtype == torch.float32), "NZ": sizes[0], "NX": sizes[3], "H": sizes[1],
-              "CURVE": activation.upper()}
+              "CURVE": activation.upper(), "SQUARED": int(squared)}
     return "".join(f"#define {k} {v}\n" for k, v in values.items()) + '#include "paper_loss.h"\n'
 
 
 def loss_and_gradient(weights: Sequence[Tensor], activation: str, z: Tensor, f: Tensor, jacobian: Tensor | None,
-                      scale: Tensor) -> tuple[float, list[Tensor]]:
+                      scale: Tensor, squared: bool = False) -> tuple[float, list[Tensor]]:
     """(loss, its gradient in each of the weights); `jacobian` None: the loss of values alone; scale [nx, 1 + nz]."""
     rows = len(z) if jacobian is None else max(BLOCK // (f.shape[1] * weights[0].shape[0]), 16)
     total, gradient = 0.0, [torch.zeros_like(w) for w in weights]
     for at in range(0, len(z), rows):
         block = slice(at, at + rows)
         labels = (z[block], f[block], None if jacobian is None else jacobian[block])
-        total += _block(weights, CURVES[activation], *labels, scale, gradient)
+        total += _block(weights, CURVES[activation], *labels, scale, squared, gradient)
     for g in gradient:
         g /= len(z)
     return total / len(z), gradient
 
 
 def _block(weights: Sequence[Tensor], curve: Callable[[Tensor], Curve], z: Tensor, f: Tensor, jacobian: Tensor | None,
-           scale: Tensor, gradient: list[Tensor]) -> float:
+           scale: Tensor, squared: bool, gradient: list[Tensor]) -> float:
     """The sum of the loss over a block of rows; its gradient is added to `gradient`."""
     W, b = weights[::2], weights[1::2]
     a, slopes, curvatures = [z], [], []
@@ -129,20 +132,22 @@ def _block(weights: Sequence[Tensor], curve: Callable[[Tensor], Curve], z: Tenso
         a.append(s)
         slopes.append(d)
         curvatures.append(e)
-    error, y_bar = _unit(torch.addmm(b[-1], a[-1], W[-1].T) - f, scale[:, 0])
+    error, y_bar = _unit(torch.addmm(b[-1], a[-1], W[-1].T) - f, scale[:, 0], squared)
     d_bar: list[Tensor | None] = [None] * len(slopes)
     if jacobian is not None:
         tape = _Jacobian(W, slopes)
-        distance, J_bar = _unit((tape.value - jacobian).flatten(1), scale[:, 1:].flatten())
+        distance, J_bar = _unit((tape.value - jacobian).flatten(1), scale[:, 1:].flatten(), squared)
         error += distance
         d_bar = tape.backward(J_bar.view_as(jacobian), gradient[::2])
     _backward(W, a, slopes, curvatures, y_bar, d_bar, gradient)
     return error
 
 
-def _unit(r: Tensor, scale: Tensor) -> tuple[float, Tensor]:
-    """(sum over rows of |S r_b|, its gradient in the rows); zero for a row of zeros."""
+def _unit(r: Tensor, scale: Tensor, squared: bool) -> tuple[float, Tensor]:
+    """(sum over rows of |S r_b|, or its square, its gradient in the rows); zero for a row of zeros."""
     r = r * scale
+    if squared:
+        return float(r.square().sum()), 2 * r * scale
     norm = torch.linalg.vector_norm(r, dim=1, keepdim=True)
     return float(norm.sum()), r / norm.clamp(min=torch.finfo(r.dtype).tiny) * scale
 

@@ -24,13 +24,13 @@ def network(sizes: list[int], activation: str) -> MLP:
     return MLP(sizes, activation).double()
 
 
-def eager(mlp: MLP, z: Tensor, f: Tensor, jacobian: Tensor | None, scale: Tensor) -> Tensor:
+def eager(mlp: MLP, z: Tensor, f: Tensor, jacobian: Tensor | None, scale: Tensor, power: int = 1) -> Tensor:
     """The definition, with the Jacobian by automatic differentiation."""
-    error = ((mlp(z) - f) * scale[:, 0]).norm(dim=1).mean()
+    error = ((mlp(z) - f) * scale[:, 0]).norm(dim=1).pow(power).mean()
     if jacobian is None:
         return error
     residual = (torch.func.vmap(torch.func.jacrev(mlp))(z) - jacobian) * scale[:, 1:]
-    return error + residual.flatten(1).norm(dim=1).mean()
+    return error + residual.flatten(1).norm(dim=1).pow(power).mean()
 
 
 def test_the_loss_is_the_papers():
@@ -44,17 +44,18 @@ def test_the_loss_is_the_papers():
     assert got == pytest.approx(float(want.detach()), rel=1e-7)
 
 
-@pytest.mark.parametrize("gradients", [True, False])
+@pytest.mark.parametrize(("gradients", "squared"), [(True, False), (False, False), (True, True)])
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 @pytest.mark.parametrize(("sizes", "compiled"), [([5, 13, 13, 3], True), ([5, 13, 13, 3], False), ([4, 6, 2], False),
                                                  ([7, 6, 6, 6, 5], False), ([16, 8, 8, 12], True)])
-def test_the_gradient_is_that_of_autograd(sizes, compiled, activation, gradients):
+def test_the_gradient_is_that_of_autograd(sizes, compiled, activation, gradients, squared):
     mlp, (z, f, J) = network(sizes, activation), labels(sizes[0], sizes[-1])
     scale = torch.rand(sizes[-1], 1 + sizes[0], generator=torch.Generator().manual_seed(2), dtype=torch.float64) + 0.5
-    want = eager(mlp, z[ROWS], f[ROWS], J[ROWS] if gradients else None, scale)
+    want = eager(mlp, z[ROWS], f[ROWS], J[ROWS] if gradients else None, scale, 1 + squared)
     theta = parameters_to_vector(mlp.parameters()).detach()
     parts = torch.autograd.grad(want, list(mlp.parameters()), allow_unused=True, materialize_grads=True)
-    loss = Loss(sizes, activation, z, f, J if gradients else None, compiled=compiled, scale=scale)
+    loss = Loss(sizes, activation, z, f, J if gradients else None, compiled=compiled, scale=scale,
+                squared=squared)
     got = torch.empty_like(theta)
     assert loss(ROWS, theta, got) == pytest.approx(float(want.detach()), rel=1e-12)
     torch.testing.assert_close(got, torch.cat([p.flatten() for p in parts]), rtol=1e-12, atol=1e-14)

@@ -1,6 +1,7 @@
 /* The paper's identification loss of a three-layer MLP and its gradient, over a batch: values and full Jacobians.
 
-   The includer defines SINGLE (1: float, 0: double), NZ, NX, H (sizes) and CURVE (SINE, TANH, RELU or SILU). With
+   The includer defines SINGLE (1: float, 0: double), NZ, NX, H (sizes), CURVE (SINE, TANH, RELU or SILU) and, if the
+   norms below are to be squared, SQUARED 1. With
    t1 = W1 z + b1, a1 = s(t1), t2 = W2 a1 + b2, a2 = s(t2), y = W3 a2 + b3, D = diag s'(t), the loss of a sample is
    |S (y - f)| + |S_J * (J - df/dz)|, J = W3 D2 W2 D1 W1, entry by entry: what is normalised is weighed in physical
    units by scale [NX + NX NZ], first S, then S_J by rows. One sample a vector lane; a tile is T vectors of samples, few enough to
@@ -16,6 +17,9 @@
 #define RELU 2
 #define SILU 3
 
+#ifndef SQUARED
+#define SQUARED 0
+#endif
 #if SINGLE
 typedef float real;
 #define F(name) name##f
@@ -251,7 +255,7 @@ static void jacobian(tile *s, const real *w)
     product(NZ, H, w, 1, NZ, C, LD, s->G1, s->J);
 }
 
-/* The gradient of each sample's |scale (x - label)|, into x [rows][NX T] in rows of ld; 0 in lanes beyond `left`.
+/* The gradient of each sample's |scale (x - label)| (or its square), into x [rows][NX T] in rows of ld; 0 in lanes beyond `left`.
    Row r, equation o has scale[r + o stride]. Returns the sum of the norms. */
 INLINE real units(int rows, int ld, vec *x, const vec *label, const real *scale, int stride, int64_t left)
 {
@@ -267,8 +271,8 @@ INLINE real units(int rows, int ld, vec *x, const vec *label, const real *scale,
         for (int lane = 0; lane < LANES; ++lane) {
             const real norm = F(sqrt)(square[t][lane]);
             const int own = t * LANES + lane < left;
-            total += own ? norm : 0;
-            square[t][lane] = own && norm > 0 ? 1 / norm : 0;
+            total += own ? (SQUARED ? square[t][lane] : norm) : 0;
+            square[t][lane] = own && norm > 0 ? (SQUARED ? 2 : 1 / norm) : 0;
         }
     for (int r = 0; r < rows; ++r)
         for (int c = 0; c < C; ++c) x[r * ld + c] *= square[c % T] * scale[r + c / T * stride];
