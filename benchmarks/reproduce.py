@@ -1,27 +1,30 @@
-"""Keeps what `nocl reproduce gym|quadrotor --out RUN` made: a row for each way, problem and seed.
+"""Keeps what `nocl reproduce gym|quadrotor|dubins|approaches --out RUN` made.
 
-    python benchmarks/reproduce.py gym RUN         # -> results/reproduce_gym.json
+    python benchmarks/reproduce.py gym RUN         # -> results/reproduce_gym.json: way, problem, seed
     python benchmarks/reproduce.py quadrotor RUN   # -> results/reproduce_quadrotor.json
+    python benchmarks/reproduce.py dubins RUN      # -> results/reproduce_dubins.json: the table's rows
+    python benchmarks/reproduce.py approaches RUN  # -> results/reproduce_approaches.json: problem, way
 
-The tables themselves, over the seeds and beside the paper's numbers, are RUN/gym.md and RUN/quadrotor.md.
+The tables themselves, over the seeds and beside the paper's numbers, are RUN/gym.md, RUN/quadrotor.md and so on.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import provenance
 
-from nocl.comparisons.reproduce import control
+from nocl.comparisons.reproduce import approaches, control, dubins
 
 
 def summary(cell: control.Cell) -> dict[str, Any]:
     """A cell without its initial states: mean, standard deviation and worst over those that did not fail."""
-    row: dict[str, Any] = {"problem": cell.problem, "way": cell.way, "seed": cell.seed, **cell.key,
+    row: dict[str, Any] = {"problem": cell.problem, "way": cell.way, "seed": cell.seed, "key": cell.key,
                            "failed": int((~np.isfinite(cell.error)).sum()), "made": cell.made}
     for what in ("error", "magnitude", "cost"):
         values = np.asarray(getattr(cell, what))
@@ -34,18 +37,28 @@ def summary(cell: control.Cell) -> dict[str, Any]:
     return row
 
 
+def plain(row: Any) -> dict[str, Any]:
+    """A row of a table as data; None where there is no number."""
+    return {name: value if not isinstance(value, float) else digits(value) if math.isfinite(value) else None
+            for name, value in asdict(row).items()}
+
+
 def digits(x: float) -> float:
     return float(f"{x:.5g}")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("table", choices=list(control.TABLES))
+    parser.add_argument("table", choices=[*control.TABLES, "dubins", "approaches"])
     parser.add_argument("run", type=Path)
     options = parser.parse_args()
-    cells = control.finished(options.run, options.table)
-    print(provenance.write(f"reproduce_{options.table}", [summary(cell) for cell in cells],
-                           cells=f"nocl reproduce {options.table}"))
+    if options.table == "dubins":
+        rows = [plain(entry) for entry in dubins.table(dubins.finished(options.run))]
+    elif options.table == "approaches":
+        rows = [plain(cell) for cell in approaches.finished(options.run)]
+    else:
+        rows = [summary(cell) for cell in control.finished(options.run, options.table)]
+    print(provenance.write(f"reproduce_{options.table}", rows, cells=f"nocl reproduce {options.table}"))
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import json
 import math
 from dataclasses import replace
 
@@ -114,6 +115,17 @@ def test_ddp_counts_its_forward_evaluations():
     assert rolled >= 4 * 10 * (4 + int(solution.iterations.sum()))  # the guesses, and a trial step an iteration
     ddp.solve(x0, workers=1)
     assert ddp.evaluations["rollout"] == 2 * rolled
+
+
+def test_cells_of_the_papers_method_know_its_settings():
+    """They survive JSON unchanged, and another budget is another cell."""
+    plan = Plan("quadrotor", iterations=7)
+    key = control._key(plan, "quadrotor", "r0-paper", 0)
+    assert key == json.loads(json.dumps(key))
+    assert (key["iterations"], key["near_goal"]) == (7, 1e-3)
+    assert key != control._key(replace(plan, iterations=8), "quadrotor", "r0-paper", 0)
+    assert control._key(replace(plan, table="gym"), "cartpole", "cnd-paper", 0)["near_goal"] is None
+    assert "iterations" not in control._key(plan, "quadrotor", "cnd", 0)
 
 
 def test_means_spread_over_states_and_over_seeds():

@@ -42,7 +42,7 @@ DRAWN = 6  # trajectories that a cell of the quadrotor keeps for the figure
 NODES = 41  # of those
 # of the paper's method on the quadrotor: with U = [-100, 100]^4 controllers that start at random, or learn at the rate
 # of 0.01, spin the body up within a second and do not learn to fly; held controls are four times as fast to train
-NEAR: dict[str, Any] = {"near_goal": 1e-3, "learning_rate": 3e-3, "race": 1, "hold": True}
+NEAR: dict[str, Any] = {"near_goal": 1e-3, "learning_rate": 3e-4, "decay": 0.1, "race": 1, "hold": True}
 DEFAULTS = ("cnd", "cnd-learned")  # the rows of nocl's default
 OC_DROPS = 5  # of NeuralOC's learning rate while it trains
 POSITION = ("px", "py", "pz")
@@ -330,7 +330,8 @@ def _key(plan: Plan, problem: str, name: str, seed: int) -> dict[str, Any]:
     way = TABLES[plan.table].ways[name]
     key: dict[str, Any] = {"n": plan.states(way), "quick": plan.quick}
     if name.endswith(("paper", "paper-learned")):
-        key["iterations"] = plan.iterations
+        settings = asdict(paper_settings(problem, plan))
+        key |= {k: list(v) if isinstance(v, tuple) else v for k, v in settings.items()}  # as JSON has them
     if _is_shipped(plan, name, seed):
         from nocl.solvers.cnd import pretrained
 
