@@ -88,6 +88,7 @@ def test_the_table_compares_with_the_optimum_of_the_same_states():
     assert entries["cnd"].gap == pytest.approx(7.5)
     assert entries["cnd"].ratio == pytest.approx(4.3 / 4.0)
     assert entries["optimum"].gap == pytest.approx(0.0)
+    assert entries["cnd"].gap95 == pytest.approx(9.75)  # of 5 and 10 %
     assert math.isnan(dubins.table([CND])[0].gap)
 
 

@@ -87,6 +87,12 @@ def run(out: str | Path, plan: Plan | None = None, *, progress: bool = True) -> 
     return cells
 
 
+def finished(out: str | Path) -> list[Cell]:
+    """All cells that the folder holds, by rising numbers of states."""
+    cells = [_read(path) for path in sorted((Path(out) / CELLS).glob("approaches-*.json"))]
+    return sorted(cells, key=lambda c: (PROBLEMS.index(c.problem), list(WAYS).index(c.way)))
+
+
 def _key(way: str, plan: Plan, problem: str) -> dict[str, Any]:
     """What a cell is made with; of CND the controller that comes with nocl, too."""
     key: dict[str, Any] = {"nodes": plan.nodes} if way == "level-sets" else {"states": plan.states}

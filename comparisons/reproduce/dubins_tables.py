@@ -32,13 +32,13 @@ def write(folder: str | Path, cells: Sequence[Cell]) -> list[Path]:
 
 def markdown(entries: Sequence[Entry]) -> str:
     """A row for each way: ours, the paper's."""
-    lines = ["| way | length, mean ± s.d. | success | collisions | ms a state | mean cost | median gap "
+    lines = ["| way | length, mean ± s.d. | success | collisions | ms a state | mean cost | gap: median, 95 % "
              "| length / optimum's | states | made | paper: length, s, success |", f"|{'---|' * 11}"]
     for e in entries:
         paper = WAYS[e.way].paper
         theirs = "" if paper is None else f"{paper[0]:.3f} ± {paper[1]:.3f}, {paper[2]:.3g}, {paper[3]:.3f}"
         row = [WAYS[e.way].title, f"{e.length:.3f} ± {e.length_std:.3f}", f"{e.success:.3f}",
-               f"{e.collisions}", f"{e.ms:.3g}", f"{e.cost:.4f}", _or_blank(e.gap, "{:.2f} %"),
+               f"{e.collisions}", f"{e.ms:.3g}", f"{e.cost:.4f}", _or_blank(e.gap, f"{e.gap:.2f}, {e.gap95:.2f} %"),
                _or_blank(e.ratio, "{:.3f}"), f"{e.n}" + (f" x {e.seeds}" if e.seeds > 1 else ""), e.made, theirs]
         lines.append(f"| {' | '.join(row)} |")
     return "\n".join(lines) + "\n"
