@@ -175,6 +175,7 @@ def whole():
 
 def test_the_card_tells_how_training_went(whole, tmp_path):
     rows, value = whole.card["history"], whole.card["value"]
+    assert 0 < whole.card["fitting_seconds"] < whole.card["seconds"]
     assert [row["round"] for row in rows] == [0, 1, 2]
     for row in rows:
         assert {"labels", "loss", "gap_median", "gap_p95", "kicked_median", "kicked_p95"} <= set(row)

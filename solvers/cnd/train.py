@@ -129,7 +129,7 @@ class _Training:
         self.fine = DDP(ocp, intervals=4 * settings.intervals, dynamics=dynamics)
         self.checkpoint = None if out is None else Path(out) / CHECKPOINT
         self.hidden_progress = None if progress is None else not progress
-        self.round, self.seconds, self.evaluations = 0, 0.0, 0
+        self.round, self.seconds, self.fitting, self.evaluations = 0, 0.0, 0.0, 0
         self.history: list[dict[str, Any]] = []
         self.losses: list[float] = []
         self.value_card: dict[str, Any] = {}
@@ -200,7 +200,7 @@ class _Training:
     def _regress(self, iterations: int) -> None:
         s = self.settings
         loss = policy_loss(self.ocp, self.net, self.inverse, self.labels)
-        with self._stage(f"round {self.round}: controller", iterations) as bar:
+        with self._stage(f"round {self.round}: controller", iterations, fits=True) as bar:
             report = _Reporter(bar, iterations)
             fit(self.net, loss, len(self.labels), iterations=iterations, batch=s.batch, lr=s.lr,
                 seed=self.seed + self.round, report=report)
@@ -277,7 +277,7 @@ class _Training:
         if attempt:
             iterations, batch = 2 * iterations, s.batch
         loss = value_loss(net, labels, self.bank.scale)
-        with self._stage("value function" + (", once more" if attempt else ""), iterations) as bar:
+        with self._stage("value function" + (", once more" if attempt else ""), iterations, fits=True) as bar:
             report = _Reporter(bar, iterations)
             fit(net, loss, len(labels), iterations=iterations, batch=batch, lr=s.lr, seed=self.seed + attempt,
                 report=report)
@@ -287,6 +287,7 @@ class _Training:
         last = self.history[-1]
         return {"method": "default", "dynamics": "learned" if self.learned else "exact", "seed": self.seed,
                 "gap_median": last["gap_median"], "gap_p95": last["gap_p95"], "seconds": round(self.seconds, 1),
+                "fitting_seconds": round(self.fitting, 1),  # of these, fits of networks; the others solve problems
                 "dynamics_evaluations": self._evaluations(),
                 "settings": asdict(self.settings), "history": self.history, "value": self.value_card}
 
@@ -295,11 +296,12 @@ class _Training:
         return self.evaluations + sum(ddp.evaluations["rollout"] for ddp in (self.ddp, self.fine))
 
     @contextmanager
-    def _stage(self, name: str, total: int) -> Iterator[tqdm[Any]]:
+    def _stage(self, name: str, total: int, fits: bool = False) -> Iterator[tqdm[Any]]:
         start = time.perf_counter()
         with tqdm(total=total, desc=name, disable=self.hidden_progress, leave=True) as bar:
             yield bar
-        self.seconds += time.perf_counter() - start
+        took = time.perf_counter() - start
+        self.seconds, self.fitting = self.seconds + took, self.fitting + took * fits
 
     def _rng(self, stage: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, stage, STREAM])
@@ -313,6 +315,7 @@ class _Training:
         state = {"policy": self.net.state_dict(), "labels": _tensors(vars(self.labels)),
                  "bank": _tensors({k: v for k, v in vars(self.bank.solution).items() if k != "message"})}
         meta = {"identity": self._identity(), "round": self.round, "history": self.history, "seconds": self.seconds,
+                "fitting": self.fitting,
                 "first": self.first, "evaluations": self._evaluations()}
         self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
         store.save_checkpoint(self.checkpoint, state, meta)
@@ -326,7 +329,8 @@ class _Training:
             return False
         self.labels = Labels(**_arrays(state["labels"]))
         self.bank = SolutionBank.from_arrays(self.ddp, _arrays(state["bank"]))
-        self.round, self.history, self.seconds, self.first = (meta[k] for k in ("round", "history", "seconds", "first"))
+        self.round, self.history, self.first = meta["round"], meta["history"], meta["first"]
+        self.seconds, self.fitting = meta["seconds"], meta["fitting"]
         self.evaluations = meta.get("evaluations", 0)
         self._network()
         self.net.double().load_state_dict(state["policy"])
