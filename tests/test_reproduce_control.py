@@ -138,11 +138,12 @@ def test_means_spread_over_states_and_over_seeds():
 
 
 def test_tables_and_figures(tmp_path):
-    cells = [cell("cnd", [0.2, 0.3]), cell("cnd", [0.04], problem="cartpole")]
+    cells = [cell("cnd", [0.2]), cell("cnd", [0.3], seed=1), cell("cnd", [0.04], problem="cartpole")]
     paths = control_tables.write(tmp_path, cells, "gym")
     assert [p.name for p in paths] == ["gym.md", "gym.tex", "gym.csv", "gym.png"]
     text = paths[0].read_text()
-    assert "| acrobot | CND, nocl's default | f_theta | 0.25 ± 0.05 | 0.25 .. 0.25 |" in text
+    assert "| acrobot | CND, nocl's default | f_theta | 0.25 ± 0.05 | 0.2 .. 0.3 |" in text
+    assert "| cartpole | CND, nocl's default | f_theta | 0.04 ± 0 |  |" in text  # one seed has no spread
     assert "not run yet | 0.284 ± 0.1 | 4.62 ± 2.63 | 4789 |" in text  # the paper's Deep PILCO, beside nothing of ours
     widths = {line.count("|") for line in text.strip().splitlines()}
     assert len(widths) == 1

@@ -63,9 +63,10 @@ def markdown(entries: Sequence[Entry], name: str) -> str:
         theirs = ["", "", ""] if paper is None else [
             _pair(paper.error, paper.error_std), _pair(paper.magnitude, paper.magnitude_std),
             "" if paper.evaluations is None else f"{paper.evaluations}"]
-        row = [e.problem, way.title, "f_theta" if way.learned else "f", _pair(e.error, e.error_std),
-               _pair(e.error_low, e.error_high, "{} .. {}"), _pair(e.magnitude, e.magnitude_std),
-               _pair(e.magnitude_low, e.magnitude_high, "{} .. {}"), _number(e.cost), f"{e.failed}" if e.n else "",
+        seeds = [_pair(*pair, "{} .. {}") if e.seeds > 1 else "" for pair in
+                 ((e.error_low, e.error_high), (e.magnitude_low, e.magnitude_high))]
+        row = [e.problem, way.title, "f_theta" if way.learned else "f", _pair(e.error, e.error_std), seeds[0],
+               _pair(e.magnitude, e.magnitude_std), seeds[1], _number(e.cost), f"{e.failed}" if e.n else "",
                _number(e.evaluations), took, _number(e.ms), f"{e.seeds} x {e.n}" if e.n else "", e.made, *theirs]
         lines.append(f"| {' | '.join(row)} |")
     return "\n".join(lines) + "\n"
