@@ -5,7 +5,8 @@
 For each initial state: the optimum of the learned dynamics (DDP, global search from cold starts on 80 intervals, then
 320), run as u_k + K_k (x - x_k) on the exact f under CVODES; beside it the optimum of the exact f, found and run in the
 same way. Lost: (J - J*) / |J*| in per cent. "default" is nocl.identify's own recipe; with --networks also its structure
-without closed forms (features=False), before and after `model.refine` on the learned optima.
+without closed forms (features=False), before and after `model.refine` on the learned optima; the results are then
+learned_optimum_PROBLEM_networks.json.
 """
 
 from __future__ import annotations
@@ -86,7 +87,8 @@ def main() -> None:
             row["seconds_optimum"] = round(time.perf_counter() - start, 1)
             rows.append({k: float(f"{v:.4g}") if isinstance(v, float) else v for k, v in row.items()})
             print(rows[-1], flush=True)
-            provenance.write(f"learned_optimum_{problem}", [r for r in rows if r["problem"] == problem])
+            kept = f"learned_optimum_{problem}" + ("_networks" if options.networks else "")
+            provenance.write(kept, [r for r in rows if r["problem"] == problem])
 
 
 if __name__ == "__main__":

@@ -63,14 +63,20 @@ def initial(n_features: int, width: int, samples: Samples, generator: torch.Gene
     frequency [F] is the standard deviation of each feature's first weights; those of 0 reach the skip alone.
     """
     h = width
-    W1 = torch.randn(h, n_features + 1, generator=generator)
-    W1 *= 1.5 / math.sqrt(n_features) if frequency is None else torch.cat([frequency, torch.full((1,), 1.5)]).float()
-    W2 = torch.randn(h, h + 1, generator=generator) / math.sqrt(h)
+    W1, W2 = hidden(n_features, h, generator, frequency)
     some = slice(0, 20_000)
     phi = torch.cat([samples.phi[some], torch.ones(len(samples.phi[some]), 1, dtype=samples.phi.dtype)], 1).double()
     c = torch.linalg.lstsq(phi, samples.y[some].double(), driver="gelsd").solution.float()
     W3 = torch.cat([torch.zeros(c.shape[1], h), c[-1:].T, c[:-1].T], 1)
     return [W1, W2, W3]
+
+
+def hidden(n_features: int, width: int, generator: torch.Generator,
+           frequency: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Random W1, W2 of `initial`."""
+    W1 = torch.randn(width, n_features + 1, generator=generator)
+    W1 *= 1.5 / math.sqrt(n_features) if frequency is None else torch.cat([frequency, torch.full((1,), 1.5)]).float()
+    return W1, torch.randn(width, width + 1, generator=generator) / math.sqrt(width)
 
 
 def forward(weights: Sequence[Tensor], phi: Tensor) -> Tensor:
@@ -98,20 +104,31 @@ Draw = Callable[[int], tuple[Batch, Tensor]]  # batch size -> a fresh batch and 
 
 def soap(weights: Weights, draw: Draw, *, iterations: int, batch: int, lr: float, report: Report) -> Weights:
     """Adam in Shampoo's eigenbases (Vyas et al. 2024), cosine schedule with 50 steps of warm-up; new weights."""
+    own = [w.detach().clone().requires_grad_() for w in weights]
+
+    def value_and_gradients() -> tuple[float, Sequence[Tensor]]:
+        value = loss(own, *draw(batch))
+        return float(value.detach()), torch.autograd.grad(value, own)
+
+    return soap_steps(own, value_and_gradients, iterations=iterations, lr=lr, report=report)
+
+
+def soap_steps(weights: Weights, value_and_gradients: Callable[[], tuple[float, Sequence[Tensor]]], *, iterations: int,
+               lr: float, report: Report) -> Weights:
+    """`soap` on the loss and its gradients at these weights, which are changed in place; the result is detached."""
     from pytorch_optimizer import SOAP
 
-    own = [w.detach().clone().requires_grad_() for w in weights]
     if not iterations:
-        return [w.detach() for w in own]
-    optimizer = SOAP(own, lr=lr, weight_decay=0.0)
+        return [w.detach() for w in weights]
+    optimizer = SOAP(weights, lr=lr, weight_decay=0.0)
     for i in range(iterations):
         optimizer.param_groups[0]["lr"] = lr * min(1.0, (i + 1) / 50) * _cosine(i / iterations)
-        value = loss(own, *draw(batch))
-        for w, g in zip(own, torch.autograd.grad(value, own), strict=True):
+        value, gradients = value_and_gradients()
+        for w, g in zip(weights, gradients, strict=True):
             w.grad = g
         optimizer.step()
-        report(float(value.detach()) ** 0.5)
-    return [w.detach() for w in own]
+        report(value ** 0.5)
+    return [w.detach() for w in weights]
 
 
 def _cosine(progress: float) -> float:

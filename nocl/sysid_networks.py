@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nocl import fit
+from nocl import fit, sysid_plain
 from nocl.checks import Array
 from nocl.nets import MLP, FeatureNet
 from nocl.structure import Box, Group, Structure
@@ -49,7 +49,16 @@ def fit_group(box: Box, parts: Structure, pool: Pool, index: int, settings: Sett
     samples, mean, spread = _samples(box, group, pool, index, settings.angles)
     generator = torch.Generator().manual_seed(seed * 1000 + index)
     draws = Draws(samples, settings.gradient_weight, generator)
-    budget = settings.budget(len(group.variables))
+    title, v = f"network {index + 1}/{len(parts.groups)}", len(group.variables)
+    plain = draws.variables > FULL_JACOBIAN and not (settings.angles and set(group.variables) & set(box.angles))
+    budget = settings.budget(v, plain)
+    if plain:
+        own = None if old is None else [old[0], old[1], _scaled(old, -mean / spread, 1 / spread)]
+        with bar.stage(f"{title}, SOAP", budget.iterations) as report:
+            weights = sysid_plain.train(samples, budget, settings.lr if old is None else settings.lr / 4,
+                                        settings.gradient_weight, generator, report,
+                                        None if frequency is None else frequency[index], own)
+        return [*weights[:2], _scaled(weights, mean, spread)]
     if old is None:
         weights = fit.initial(samples.phi.shape[1], budget.width, samples, generator,
                               None if frequency is None else frequency[index])
@@ -57,7 +66,6 @@ def fit_group(box: Box, parts: Structure, pool: Pool, index: int, settings: Sett
         weights = [old[0], old[1], _scaled(old, -mean / spread, 1 / spread)]
     polish = budget.polish if sum(w.numel() for w in weights) <= MAX_POLISHED else 0
     iterations = 0 if old is not None and polish else budget.iterations
-    title = f"network {index + 1}/{len(parts.groups)}"
     if iterations:
         with bar.stage(f"{title}, SOAP", iterations) as report:
             weights = fit.soap([w.float() for w in weights], draws.to(torch.float32), iterations=iterations,

@@ -33,6 +33,12 @@ class Budget:
         return Budget(48 if variables <= 6 else 96, 6000, 1024, 40, 1024)
 
 
+    @staticmethod
+    def plain(variables: int) -> Budget:
+        """Of one plain network of many variables with Jacobian labels (nocl.sysid_plain), one to two minutes."""
+        return Budget(96 if variables <= 6 else 128, 15_000, 512, 0, 512)
+
+
 @dataclass(frozen=True)
 class Settings:
     """Of methods "default" and "mlp". None: by the number of a network's variables, as in Budget.of."""
@@ -57,10 +63,11 @@ class Settings:
         _positive(self, ("lr",))
         _positive(self, ("gradient_weight",), zero=True)
 
-    def budget(self, variables: int) -> Budget:
+    def budget(self, variables: int, plain: bool = False) -> Budget:
         """The budget of a network of so many variables."""
         own = {name: getattr(self, name) for name in Budget.__dataclass_fields__}
-        return replace(Budget.of(variables), **{name: value for name, value in own.items() if value is not None})
+        default = Budget.plain(variables) if plain else Budget.of(variables)
+        return replace(default, **{name: value for name, value in own.items() if value is not None})
 
 
 @dataclass(frozen=True)
