@@ -83,9 +83,11 @@ def score(ocp: OCP, cnd: nocl.CND, n: int, sigma: float, seed: int = 12345) -> d
     rng = np.random.default_rng(seed)
     x0 = ocp.initial_states.sample(n, rng)
     best = optimum(ocp, x0, cnd.policy)
+    unsolved = int((~best.success).sum())
+    x0, best = x0[best.success], best[best.success]
     run = simulate(ocp, cnd, x0)
     gap = run.cost / best.cost - 1
-    row = {"failed": int((~run.success).sum() + (~best.success).sum()), "J*": round(float(best.cost.mean()), 5),
+    row = {"failed": int((~run.success).sum()), "unsolved": unsolved, "J*": round(float(best.cost.mean()), 5),
            "gap": quantiles(gap), "terminal_error": round(float(run.terminal_error.mean()), 4),
            "control": round(float(run.control_magnitude.mean()), 3), "collisions": int((run.clearance < 0).sum()),
            "worst": [explained(ocp, x0[i], float(gap[i]), float(run.cost[i])) for i in np.argsort(-gap)[:3]]}
