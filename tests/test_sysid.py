@@ -157,6 +157,24 @@ def test_values_alone_and_the_plain_network():
     assert plain.score().mean < 1.5  # the mean: 6.9
 
 
+def test_a_plain_network_of_many_variables_keeps_what_is_linear_apart():
+    """p and v of the cart-pole enter linearly, and the rates of p and theta are v and omega: the skip has them."""
+    system, settings = cartpole.system(), Settings(width=16, iterations=150, batch=128, samples=3000)
+    model = identify(system, method="mlp", settings=settings, progress=False)
+    W1, _, W3 = weights_of(model.net.nets[0])
+    assert W1.shape == (16, 6)
+    assert (W1[:, :2] == 0).all()
+    assert (W1[:, 2:] != 0).any(dim=0).all()
+    assert (W3[[0, 2], :16] == 0).all()
+    x, u = rows(system)
+    torch.testing.assert_close(model(x, u)[:, [0, 2]], x[:, [1, 3]], atol=1e-9, rtol=0)
+    untrained = identify(system, method="mlp", settings=dataclasses.replace(settings, iterations=0), progress=False)
+    assert model.score().mean < 0.9 * untrained.score().mean  # 150 small steps
+    z = np.zeros((3, 4)), np.zeros((3, 1))
+    same = model.refine(*z, settings=dataclasses.replace(settings, iterations=0), progress=False)
+    torch.testing.assert_close(same(x, u), model(x, u), atol=1e-6, rtol=0)  # through float32
+
+
 def test_given_data_alone_is_used():
     """The system's equations may be anything: with data they are not asked."""
     system = pendulum.system()
