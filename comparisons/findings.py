@@ -93,8 +93,10 @@ class MethodAudit:
         """Where the model is not to be trusted; "" where it does not know."""
         if self.doubt is None:
             return ""
-        return (f"{self.method}: the model is not to be trusted somewhere along {int((self.doubt > 0).sum())} of "
-                f"{len(self.doubt)} trajectories.")
+        known = self.doubt[np.isfinite(self.doubt)]
+        failed = "" if len(known) == len(self.doubt) else f"; {len(self.doubt) - len(known)} more failed"
+        return (f"{self.method}: the model is not to be trusted somewhere along {int((known > 0).sum())} of "
+                f"{len(known)} trajectories{failed}.")
 
     def summary(self) -> Row:
         """Quantiles of each number over the states."""

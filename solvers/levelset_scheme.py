@@ -31,6 +31,7 @@ from nocl.to_jax import to_jax
 REFINEMENTS = 12  # halvings of the search for a sampled minimum
 SAFETY = 1.05  # on max |f_i| that was found by sampling
 SAMPLED = 4096  # nodes at which the signs of f are looked at
+BISECTIONS = 14  # of the slope at which a state stands still
 STILL = 1e-12  # |f_i| below it: not driven to that side
 
 
@@ -92,22 +93,35 @@ class Dynamics(hj.dynamics.Dynamics):
         """The Hamiltonian [...] of the differences in y [..., nx].
 
         Each axis along which all controls of a node drive to one side has the difference on that side; along the
-        others the minimisers for the left one, the right one and that nearest to 0 are tried, and the best is taken.
+        others the minimisers for the left one, the right one, and of those between them that nearest to 0 and that
+        which holds the state still along the axis are tried, and the best is taken.
         """
         slopes = self._slopes(states)
         left, right = left / slopes, right / slopes
         nearest = jnp.clip(0.0, jnp.minimum(left, right), jnp.maximum(left, right))
         upwind = jnp.where(self._ends(states)[1] > STILL, right, left)
         best = jnp.full(states.shape[:-1], jnp.inf)
-        for sides in itertools.product((left, right, nearest), repeat=len(self.undecided)):
+        for sides in itertools.product((left, right, nearest, None), repeat=len(self.undecided)):
             p = upwind
             for i, side in zip(self.undecided, sides, strict=True):
-                p = p.at[..., i].set(side[..., i])
+                p = p.at[..., i].set((left + right)[..., i] / 2 if side is None else side[..., i])
+            for i, side in zip(self.undecided, sides, strict=True):
+                p = p if side is not None else self._still(states, p, i, left, right)
             u = self.minimise.traced(states, p)[0]
             f = self.f(states, u)
             H = self.L(states, u)[..., 0] + jnp.sum(jnp.maximum(f, 0) * right + jnp.minimum(f, 0) * left, -1)
             best = jnp.minimum(best, H)
         return best
+
+    def _still(self, states: Any, p: Any, i: int, left: Any, right: Any) -> Any:
+        """p with its i-th entry between left and right where the minimiser drives along axis i neither way, by
+        bisection: f_i at the minimiser of L + p'f falls as p_i rises. An end, where there is none."""
+        low, high = jnp.minimum(left, right)[..., i], jnp.maximum(left, right)[..., i]
+        for _ in range(BISECTIONS):
+            middle = (low + high) / 2
+            f = self.f(states, self.minimise.traced(states, p.at[..., i].set(middle))[0])[..., i]
+            low, high = jnp.where(f > 0, middle, low), jnp.where(f > 0, high, middle)
+        return p.at[..., i].set((low + high) / 2)
 
     def rate(self, states: Any) -> Any:
         """The most cells that a control crosses in a second, at any of the nodes."""

@@ -270,6 +270,10 @@ def train_neural_oc(ocp: OCP, settings: NeuralOCSettings | None = None, *, dynam
         trainer = _Trainer(ocp, settings, seed)
         trainer.train(progress)
         seconds = time.perf_counter() - start
+    if not math.isfinite(trainer.lowest):
+        raise ValueError(f"NeuralOC on {ocp.system.name}: no network has a finite loss on held-out states; expected "
+                         f"one: try a smaller learning_rate (is {settings.learning_rate:g}) or more steps (are "
+                         f"{settings.steps})")
     net = trainer.net.double()
     net.load_state_dict(trainer.best)
     card = {"method": "NeuralOC", "settings": asdict(settings) | {"weights": list(settings.weights)}, "seed": seed,
@@ -337,7 +341,7 @@ class _Trainer:
         self.check_finite()
         self.adam.step()
         k = len(self.rows)
-        if k % s.check_every == 0 or k == s.iterations:
+        if k % s.check_every == 0 or k % s.drop_every == 0 or k == s.iterations:
             self.look(k)
         if k % s.drop_every == 0:
             self.net.load_state_dict(self.best)

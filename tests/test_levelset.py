@@ -155,6 +155,22 @@ def test_the_upwind_hamiltonian_is_the_minimum_over_controls_each_with_its_own_s
         np.testing.assert_allclose(same, np.asarray(dynamics.minimise.traced(x, left)[1]), atol=1e-12)
 
 
+def test_the_upwind_hamiltonian_holds_a_drifting_state_still_in_a_fold_of_v():
+    """By brute force again: gravity drives omega, so the best control in a fold is neither side's nor that of 0."""
+    ocp = nocl.load_ocp("pendulum")
+    axes = tuple(levelset_scheme.axis(-4.0, 4.0, 21, 0.0, np.inf, False) for _ in range(2))
+    with levelset.jax.enable_x64(True):
+        dynamics = levelset_scheme.Dynamics(ocp, levelset_scheme.exact_minimiser(ocp), axes, 9)
+        assert dynamics.undecided == [1]
+        rng = np.random.default_rng(0)
+        x, left, right = rng.uniform(-3, 3, (300, 2)), rng.normal(0, 0.1, (300, 2)), rng.normal(0, 0.1, (300, 2))
+        H, best = np.asarray(dynamics.upwind(x, left, right)), np.full(300, np.inf)
+        for u in np.linspace(-5, 5, 4001):
+            f, L = (np.asarray(g(x.T, u)).T for g in (ocp.system.f, ocp.L_soft))
+            best = np.minimum(best, L[:, 0] + (np.maximum(f, 0) * right + np.minimum(f, 0) * left).sum(axis=1))
+        np.testing.assert_allclose(H, best, atol=1e-3)
+
+
 def test_stretching_helps_where_the_goal_is_small():
     """van der Pol's V against the optimum of DDP: 4 % off where it is 8 % on uniform axes."""
     from nocl.solvers.ddp import DDP
