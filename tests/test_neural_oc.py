@@ -207,7 +207,7 @@ def test_shapes_and_messages(trained):
 
 
 def test_the_card(trained):
-    """nfe: 4 stages of 10 steps for 16 states, in 4 iterations and at 2 looks at the held-out ones."""
+    """nfe: 4 stages of 10 steps for 16 states, in 4 iterations and at 3 looks at the held-out ones."""
     card = trained.card
     assert card["nfe"] == 4 * 10 * 16 * 7
     assert card["seconds"] > 0
