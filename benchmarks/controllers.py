@@ -83,22 +83,22 @@ def score(ocp: OCP, cnd: nocl.CND, n: int, sigma: float, seed: int = 12345) -> d
     rng = np.random.default_rng(seed)
     x0 = ocp.initial_states.sample(n, rng)
     best = optimum(ocp, x0, cnd.policy)
-    unsolved = int((~best.success).sum())
-    x0, best = x0[best.success], best[best.success]
-    run = simulate(ocp, cnd, x0)
-    gap = run.cost / best.cost - 1
-    row = {"failed": int((~run.success).sum()), "unsolved": unsolved, "J*": round(float(best.cost.mean()), 5),
-           "gap": quantiles(gap), "terminal_error": round(float(run.terminal_error.mean()), 4),
+    run, known = simulate(ocp, cnd, x0), best.success
+    gap = np.where(known, run.cost / best.cost - 1, -np.inf)
+    row = {"failed": int((~run.success).sum()), "unsolved": int((~known).sum()),
+           "J*": round(float(best.cost[known].mean()), 5), "gap": quantiles(gap[known]),
+           "terminal_error": round(float(run.terminal_error.mean()), 4),
            "control": round(float(run.control_magnitude.mean()), 3), "collisions": int((run.clearance < 0).sum()),
            "worst": [explained(ocp, x0[i], float(gap[i]), float(run.cost[i])) for i in np.argsort(-gap)[:3]]}
     slots = np.sort(rng.choice(np.arange(1, SLOTS - 1), 5, replace=False))
     pushes = [(int(s), sigma * rng.standard_normal(x0.shape)) for s in slots]
     kicked = simulate(ocp, cnd, x0, kicks=[(s * ocp.horizon / SLOTS, dx) for s, dx in pushes])
     kicked_best = resolved(ocp, best, pushes)
-    row["kicked_gap"] = quantiles(kicked.cost / kicked_best - 1)
+    row["kicked_gap"] = quantiles((kicked.cost / kicked_best - 1)[known])
     lost = (kicked.cost - best.cost - cost_of_kicks(ocp, cnd.policy, kicked, pushes)) / kicked_best
-    known = np.isfinite(lost)
-    row["kicked_loss"] = quantiles(lost[known]) | {"left_out": int((~known).sum())}
+    told = np.isfinite(lost)
+    row["kicked_loss"] = quantiles(lost[told]) | {"left_out": int((~told).sum())}
+    x0, best = x0[known], best[known]
     V = cnd.value(x0, 0.0)
     row["value_error_%"] = round(100 * float(np.mean(np.abs(V / best.cost - 1))), 3)
     cosine = _cosine(cnd.value_gradient(x0, 0.0), best.V_x[:, 0])

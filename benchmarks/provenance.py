@@ -13,7 +13,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-RESULTS = Path(__file__).parent / "results"
+ROOT = Path(__file__).parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
 
 
 def write(name: str, rows: Any, **more: Any) -> Path:
@@ -24,10 +25,20 @@ def write(name: str, rows: Any, **more: Any) -> Path:
     return path
 
 
+def commit() -> str:
+    """The commit of the working tree; "+" behind it where Python files differ from it."""
+    def git(*words: str) -> str:
+        return subprocess.run(["git", *words], capture_output=True, text=True, check=False, cwd=ROOT).stdout
+
+    changed = git("status", "--porcelain", "--untracked-files=no", "--", "*.py", "*.h")
+    return git("rev-parse", "--short", "HEAD").strip() + "+" * bool(changed)
+
+
+STARTED = commit()  # read when a benchmark starts: others may commit while it runs
+
+
 def made() -> dict[str, Any]:
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False,
-                            cwd=Path(__file__).parent).stdout.strip()
-    return {"command": command(), "commit": commit,
+    return {"command": command(), "commit": STARTED,
             "date": datetime.now(UTC).strftime("%Y-%m-%d"),
             "versions": {p: version(p) for p in ("nocl", "casadi", "torch", "numpy", "scipy")},
             "machine": f"{platform.machine()}, {os.cpu_count()} cores, Python {platform.python_version()}"}

@@ -13,6 +13,14 @@ from nocl.solvers import NMPC
 from nocl.systems import cartpole
 
 
+@pytest.fixture(autouse=True)
+def ctrl_c_counts():
+    """Jobs in the background of a shell inherit that it is ignored."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 def press():
     os.kill(os.getpid(), signal.SIGINT)
 

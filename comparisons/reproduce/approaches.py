@@ -20,6 +20,7 @@ import numpy as np
 from tqdm import tqdm
 
 from nocl import store
+from nocl.comparisons.reproduce.cells import read_cell
 from nocl.comparisons.reproduce.dubins import rollout_ms
 from nocl.solvers.compiled import fingerprint
 from nocl.systems import load_ocp
@@ -102,11 +103,7 @@ def _key(way: str, plan: Plan, problem: str) -> dict[str, Any]:
 
 
 def _read(path: Path) -> Cell:
-    data = store.read_json(path)
-    try:
-        return Cell(**{**data, **{name: float(data[name]) for name in ("memory", "before", "ms")}})
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} is no cell of the table of approaches ({error}); delete it") from error
+    return read_cell(path, Cell, "the table of approaches", ("memory", "before", "ms"))
 
 
 def _level_sets(problem: str, plan: Plan) -> Cell:

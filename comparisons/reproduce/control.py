@@ -25,6 +25,7 @@ from tqdm import tqdm
 
 from nocl import store
 from nocl.checks import Array
+from nocl.comparisons.reproduce.cells import read_cell
 from nocl.comparisons.reproduce.dubins import INTERVALS, rollout_ms
 from nocl.ocp import OCP
 from nocl.simulate import simulate
@@ -342,13 +343,8 @@ def _key(plan: Plan, problem: str, name: str, seed: int) -> dict[str, Any]:
 
 
 def _read(path: Path) -> Cell:
-    data = store.read_json(path)
-    lists, numbers = ("error", "magnitude", "cost", "paths"), ("seconds", "cpu", "identify", "evaluations", "ms")
-    try:
-        values = {name: np.asarray(data[name], dtype=float).tolist() for name in lists}  # 'inf', 'nan' to numbers
-        return Cell(**{**data, **values, **{name: float(data[name]) for name in numbers}})
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} is no cell of the tables of control ({error}); delete it") from error
+    return read_cell(path, Cell, "the tables of control",
+                      ("error", "magnitude", "cost", "paths", "seconds", "cpu", "identify", "evaluations", "ms"))
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ import importlib.util
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from tqdm import tqdm
 from nocl import store
 from nocl.checks import Array
 from nocl.comparisons.report import VIOLATION
+from nocl.comparisons.reproduce.cells import read_cell
 from nocl.integrate import rk4
 from nocl.ocp import OCP
 from nocl.simulate import Simulation, simulate
@@ -263,13 +264,7 @@ def _key(way: str, plan: Plan) -> dict[str, Any]:
 
 
 def _read(path: Path) -> Cell:
-    data = store.read_json(path)
-    try:
-        numbers = {f.name: np.asarray(data[f.name], dtype=float).tolist() for f in fields(Cell)
-                   if f.name in ("length", "error", "clearance", "cost", "paths")}  # 'inf', 'nan' to numbers
-        return Cell(**{**data, **numbers})
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} is no cell of the Dubins table ({error}); delete it") from error
+    return read_cell(path, Cell, "the Dubins table", ("length", "error", "clearance", "cost", "paths"))
 
 
 @dataclass(frozen=True)

@@ -260,16 +260,17 @@ class _Training:
         return net
 
     def _value_optima(self) -> dict[str, DDPSolution]:
-        """What V is told by: initial states, states of the tube, and states of kicked rollouts, solved anew."""
+        """What V is told by: initial states, states of the tube, and states of kicked rollouts, solved anew; those that
+        can hold the path constraints, where there are any."""
         if not hasattr(self, "starts"):  # taken up after the last round
             self._validate()
             self.history.pop()
         s = self.settings
         with self._stage("held-out states of the tube", 1) as bar:
-            tube_ = tube_optima(self.ddp, self.fine, self.bank, self.policy, self.f, 4 * s.held_out, s.width,
-                                self._rng(3_000_000))
+            near = tube_optima(self.ddp, self.fine, self.bank, self.policy, self.f, 4 * s.held_out, s.width,
+                               self._rng(3_000_000))
             bar.update()
-        sets = {"initial": self.starts, "tube": tube_, "tails": self.tails}
+        sets = {"initial": self.starts, "tube": near, "tails": self.tails}
         held = {name: feasible(self.ocp, optima) for name, optima in sets.items()}
         return {name: optima for name, optima in held.items() if len(optima)} or sets
 

@@ -92,7 +92,7 @@ def value_scores(ocp: OCP, value: FeatureNet, policy: torch.nn.Module, f: Field,
         cosine = np.clip((V_x * s.V_x[:, 0]).sum(axis=1) / (size * true), -1, 1)
         row[f"{name}_degrees"] = float(np.degrees(np.median(np.arccos(cosine))))
         row[f"{name}_slope_error"] = float(np.median(np.abs(size / true - 1)))
-    return row | _hjb(ocp, value, policy, f, s)
+    return row | _hjb(ocp, value, policy, f, list(optima.values())[-1])
 
 
 def _value_and_slope(value: FeatureNet, x: Array, t: Array) -> tuple[Array, Array]:

@@ -21,6 +21,7 @@ from nocl.solvers.bank import SolutionBank
 from nocl.solvers.cnd.features import features
 from nocl.solvers.cnd.labels import Field, answered, kicked_states, tube_states
 from nocl.solvers.cnd.regress import Loss
+from nocl.solvers.cnd.validate import refined
 from nocl.solvers.ddp import DDP, DDPSolution
 from nocl.to_torch import to_torch
 
@@ -69,12 +70,10 @@ def value_tails(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field,
 
 
 def on_fine_grid(fine: DDP, coarse: DDPSolution) -> Iterator[DDPSolution]:
-    """The solutions that succeeded, solved again on the fine grid: a held control costs O(h^2) more than a continuous
-    one. Piece by piece: they take much memory."""
-    s = coarse[coarse.success]
-    for start in range(0, len(s), PIECE):
-        p = s[start:start + PIECE]
-        yield fine.solve(p.x[:, 0], p.t[:, 0], u=np.repeat(p.u, fine.intervals // p.u.shape[1], axis=1))
+    """The solutions that succeeded on both grids: a held control costs O(h^2) more than a continuous one. Piece by
+    piece, since they take much memory."""
+    for start in range(0, len(coarse), PIECE):
+        yield refined(fine, coarse[start:start + PIECE])
 
 
 def value_net(ocp: OCP, labels: ValueLabels, sizes: tuple[int, ...]) -> FeatureNet:
