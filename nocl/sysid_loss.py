@@ -66,38 +66,52 @@ class Loss:
 
     def __init__(self, sizes: Sequence[int], activation: str, z: Tensor, f: Tensor, jacobian: Tensor | None, *,
                  compiled: bool, scale: Tensor | None = None, squared: bool = False) -> None:
-        self.activation, self.labels, self.squared = activation, (z, f, jacobian), squared
+        self.activation, self.squared = activation, squared
         self.scale = torch.ones(sizes[-1], 1 + sizes[0], dtype=z.dtype) if scale is None else scale.to(z.dtype)
-        self._scale = torch.cat([self.scale[:, 0], self.scale[:, 1:].flatten()]).numpy()
         self.shapes = [s for n, m in pairwise(sizes) for s in ((m, n), (m,))]
-        self.kernel = Kernel(_source(sizes, activation, z.dtype, squared)) if compiled else None
-        self._arrays = [None if a is None else a.contiguous().numpy() for a in self.labels]
+        self.labels = None if compiled else (z, f, jacobian)
+        self._compiled = _Compiled(sizes, activation, squared, z, f, jacobian, self.scale) if compiled else None
 
     def __call__(self, rows: Tensor, theta: Tensor, gradient: Tensor) -> float:
         """The mean of the loss over the labels' `rows` [B]; its gradient [P] is written into `gradient`."""
-        if self.kernel is not None:
+        if self._compiled is not None:
             return self._compiled(rows.numpy(), theta.numpy(), gradient.numpy())
-        z, f, jacobian = (None if a is None else a[rows] for a in self.labels)
-        assert z is not None
-        assert f is not None
+        assert self.labels is not None
+        z, f = (a[rows] for a in self.labels[:2])
+        jacobian = None if self.labels[2] is None else self.labels[2][rows]
         value, parts = loss_and_gradient(self.weights(theta), self.activation, z, f, jacobian, self.scale,
                                          self.squared)
         torch.cat([p.flatten() for p in parts], out=gradient)
         return value
 
-    def _compiled(self, rows: NDArray[np.int64], theta: NDArray[np.floating],
-                  gradient: NDArray[np.floating]) -> float:
-        assert self.kernel is not None
-        value = np.empty(1)
-        self.kernel("nocl_loss", rows, len(rows), theta, *self._arrays, self._scale, gradient, value)
-        if np.isnan(value[0]) and np.isfinite(theta).all():
-            raise FloatingPointError("the loss is not a number though the weights are: labels, or memory ran out")
-        return float(value[0])
-
     def weights(self, theta: Tensor) -> list[Tensor]:
         """W_1, b_1, ..., W, b as views of theta."""
         parts = theta.split([int(np.prod(s)) for s in self.shapes])
         return [p.view(s) for p, s in zip(parts, self.shapes, strict=True)]
+
+
+class _Compiled:
+    """csrc/paper_loss.h over labels packed by rows, as it wants them: z, f, df/dz, zeros up to a multiple of 16."""
+
+    def __init__(self, sizes: Sequence[int], activation: str, squared: bool, z: Tensor, f: Tensor,
+                 jacobian: Tensor | None, scale: Tensor) -> None:
+        self.kernel = Kernel(_source(sizes, activation, z.dtype, squared))
+        parts = [z, f, *([] if jacobian is None else [jacobian.flatten(1)])]
+        padding = -sum(p.shape[1] for p in parts) % 16
+        self.labels = torch.cat([*parts, z.new_zeros(len(z), padding)], 1).numpy()
+        self.jacobians = int(jacobian is not None)
+        self.scale = torch.cat([scale[:, 0], scale[:, 1:].flatten()]).numpy()
+        size = np.empty(1, np.int64)
+        self.kernel("nocl_loss_work", size, size)
+        self.work = np.empty(-(-int(size[0]) // 8))
+
+    def __call__(self, rows: NDArray[np.int64], theta: NDArray[np.floating], gradient: NDArray[np.floating]) -> float:
+        value = np.empty(1)
+        self.kernel("nocl_loss", rows, len(rows), theta, self.labels, self.jacobians, self.scale, self.work, gradient,
+                    value)
+        if np.isnan(value[0]) and np.isfinite(theta).all():
+            raise FloatingPointError("the loss is not a number though the weights are: look at the labels")
+        return float(value[0])
 
 
 def _source(sizes: Sequence[int], activation: str, dtype: torch.dtype, squared: bool) -> str:
