@@ -413,9 +413,13 @@ def _compare(args: argparse.Namespace) -> None:
 
 
 def _other_methods(ocp: OCP, methods: Sequence[str], intervals: int) -> None:
-    """ValueError for methods that cannot be built for this problem, before long work."""
+    """ValueError for methods that cannot be built for this problem, or not be judged on it, before long work."""
     from nocl.stages import method
 
+    if ocp.system.xdot is None:
+        raise ValueError(f"the equations of {ocp.system.name!r} are not known (xdot=None), and methods are compared on "
+                         "the exact f: give that System its equations, or take the controller to the plant itself "
+                         "(nocl export) and see how far the model is right by nocl identify --data")
     for name in methods:
         if name != "CND":
             method(ocp, name, intervals)
