@@ -27,7 +27,8 @@ def train(source: Source, settings: PaperSettings, seed: int, bar: Progress) -> 
     """
     z, value, gradient = _raw_labels(source, settings, seed)
     box, mean, spread = source.box, value.mean(axis=0), value.std(axis=0)
-    centre, unit = (box.lb + box.ub) / 2, box.width / np.sqrt(12) / settings.frequency
+    centre, unit = (box.lb + box.ub) / 2, box.width / np.sqrt(12)
+    unit[list(box.angles)] /= settings.frequency
     spread = np.where(spread > 1e-12 * np.abs(value).max(axis=0), spread, 1.0)
     ratio = spread[:, None] / unit  # of a derivative in physical units to that of the network
     labels = _single((z - centre) / unit), _single((value - mean) / spread), \

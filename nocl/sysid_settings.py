@@ -93,15 +93,15 @@ class LogSettings:
 class PaperSettings:
     """Of method "paper": a three-layer MLP (two hidden layers), Adam, exponentially decaying rate."""
 
-    width: int = 64
+    width: int = 128
     layers: int = 3  # of weights
     activation: str = "sine"
     iterations: int = 50_000
-    batch: int = 1024
+    batch: int = 256
     lr: float = 0.01
     final_lr: float = 1e-5
     samples: int = 200_000
-    frequency: float = 3.0  # standard deviation of the network's inputs: 3 as of raw states in a box of +-5; outputs: 1
+    frequency: float = 6.0  # standard deviation of angles as inputs, in which f oscillates; of others, and outputs: 1
 
     def __post_init__(self) -> None:
         _positive(self, ("width", "iterations", "batch", "samples"), integer=True)
