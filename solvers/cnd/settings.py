@@ -27,7 +27,7 @@ class TrainSettings:
     value: bool = True  # whether to train V(x, t) too
     value_tails: int = 6000  # solved for V, from the tube and from the policy's own answers
     value_visits: int = 3000  # more of them, from states that the policy visits under kicks
-    value_iterations: int = 5000
+    value_iterations: int = 4500
     value_rounds: int = 2  # fits of V at most: each further one on as many labels more, twice as long, larger batches
     value_error: float = 4e-3  # stop once met: mean of |V - J*| / J* at held-out initial, tube and kicked states
     held_out: int = 64  # initial states that tell when to stop

@@ -25,7 +25,7 @@ from nocl.solvers.cnd.validate import refined
 from nocl.solvers.ddp import DDP, DDPSolution
 from nocl.to_torch import to_torch
 
-SMALL = 0.1  # of the median: labels below count as if they were that large in relative errors
+SMALL = 0.02  # of the median: labels below count as if they were that large in relative errors
 ROUND = 0.01  # relative errors above it count by their size, not their square: few labels are hard, or not global
 PIECE = 2000  # problems solved on the fine grid at a time
 CHUNK = 20_000  # labels whose features are computed at a time
