@@ -376,10 +376,9 @@ class Entry:
 
 
 def table(cells: Sequence[Cell], name: str) -> list[Entry]:
-    """One entry a problem and way that has cells or a row of the paper's, in the order of the table."""
+    """One entry a problem and way, in the order of the table; those without cells say that they have not been run."""
     t = TABLES[name]
-    groups = {(p, w): [c for c in cells if (c.problem, c.way) == (p, w)] for p in t.problems for w in t.ways}
-    return [_entry(p, w, group) for (p, w), group in groups.items() if group or t.ways[w].make is None]
+    return [_entry(p, w, [c for c in cells if (c.problem, c.way) == (p, w)]) for p in t.problems for w in t.ways]
 
 
 def _entry(problem: str, way: str, cells: Sequence[Cell]) -> Entry:
