@@ -1,6 +1,7 @@
 """Trained controllers as feedback: the gap to the optimum in continuous time, on hidden states, and under kicks.
 
     python benchmarks/controllers.py [PROBLEM ...] [--dynamics exact learned] [--seeds 0 1 2] [--n 200]
+    python benchmarks/controllers.py "cartpole, wide box" van_der_pol --seeds 0 --results controllers_more
     python benchmarks/controllers.py --table pretrained controllers      # the results of those files as markdown
 
 Every controller is judged by CVODES on the exact f, as continuous feedback, from initial states that training did not
@@ -25,6 +26,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
 import provenance
+from ddp import problem as load_problem
 
 import nocl
 from nocl.checks import Array
@@ -169,7 +171,7 @@ def main() -> None:
         print(table(options.table))
         return
     for seed, problem, dynamics in product(options.seeds, options.problems, options.dynamics):
-        ocp, keep = nocl.load_ocp(problem), options.keep if seed == options.seeds[0] else None
+        ocp, keep = load_problem(problem), options.keep if seed == options.seeds[0] else None
         cnd, seconds = trained(ocp, dynamics, seed, keep)
         rows.append({"problem": problem, "dynamics": dynamics, "seed": seed, **seconds,
                      **score(ocp, cnd, options.n, options.sigma)})
