@@ -195,6 +195,8 @@ def test_paper_method_learns():
     relu = identify(pendulum.system(), method="paper", gradients=False, progress=False,
                     settings=dataclasses.replace(settings, activation="relu", iterations=2))
     assert relu.card["gradients"] is False
+    spread = model.net.features(*rows(pendulum.system(), 5000))[0].std(dim=0)  # of theta, in which f oscillates; others
+    torch.testing.assert_close(spread, torch.tensor([6.0, 1.0, 1.0]).double(), rtol=0.03, atol=0)
 
 
 @pytest.mark.parametrize("change", [
