@@ -241,8 +241,8 @@ def test_bad_workers_are_refused(here, capsys, workers):
     assert "workers" in capsys.readouterr().err
 
 
-SMALL = TrainSettings(seeds=3, starts=2, states=6, tails=30, visits=20, rounds=0, iterations=40, value_tails=30,
-                      value_iterations=20, held_out=4, hidden=(8,))
+SMALL = TrainSettings(seeds=3, starts=2, states=6, tails=30, visits=20, rounds=0, iterations=40, value_initial=5,
+                      value_tails=30, value_iterations=20, held_out=4, hidden=(8,))
 
 
 def small(monkeypatch):

@@ -29,8 +29,8 @@ def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(stages, "QUICK_LOG", LogSettings(width=6, iterations=40, steps=4, window=20))
     monkeypatch.setattr(stages, "QUICK_TRAIN", TrainSettings(
-        seeds=2, starts=2, states=12, tails=60, visits=40, rounds=1, iterations=80, value_tails=60, value_visits=40,
-        value_iterations=40, held_out=4))
+        seeds=2, starts=2, states=12, tails=60, visits=40, rounds=1, iterations=80, value_initial=10, value_tails=60,
+        value_visits=40, value_iterations=40, held_out=4))
     (tmp_path / "plant.py").write_text(PLANT.format(xdot=None))
     (tmp_path / "exact.py").write_text(PLANT.format(xdot=EXACT))
     rng, h = np.random.default_rng(0), 0.05

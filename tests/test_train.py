@@ -36,10 +36,10 @@ from nocl.solvers.global_search import solve_globally
 module = importlib.import_module("nocl.solvers.cnd.train")  # the package has a function of that name
 
 QUICK = TrainSettings(intervals=40, seeds=4, starts=2, states=60, tails=400, visits=200, rounds=0, iterations=800,
-                      batch=512, hidden=(24, 24), value_tails=800, value_visits=200, value_iterations=800, held_out=16,
-                      gap_median=1e-9)
+                      batch=512, hidden=(24, 24), value_initial=100, value_tails=800,
+                      value_visits=200, value_iterations=800, held_out=16, gap_median=1e-9)
 TINY = replace(QUICK, intervals=20, batch=64, states=10, tails=40, visits=20, rounds=2, iterations=30, hidden=(8,),
-               value_tails=40, value_visits=10, value_iterations=20, value_rounds=1, held_out=4)
+               value_initial=10, value_tails=40, value_visits=10, value_iterations=20, value_rounds=1, held_out=4)
 
 
 def riccati(t, T=2.0, R=0.01):
@@ -461,8 +461,10 @@ def test_value_labels_are_costs_to_go_on_the_fine_grid(pendulum):
     ocp, ddp, bank, f = pendulum
     fine = DDP(ocp, intervals=160)
     (whole,) = on_fine_grid(fine, bank.solution)
-    (tails,) = on_fine_grid(fine, value_tails(ddp, bank, feedback(ocp), f, tails=12, visits=8, width=0.25, kick=0.1,
-                                              rng=np.random.default_rng(0)))
+    found = value_tails(ddp, bank, feedback(ocp), f, initial=3, tails=12, visits=8, width=0.25, kick=0.1,
+                        rng=np.random.default_rng(0))
+    assert (found.t[:3, 0] == 0).all()  # initial states first
+    (tails,) = on_fine_grid(fine, found)
     assert len(whole) == len(bank)
     assert (whole.cost <= bank.solution.cost).all()  # what is held for shorter costs less
     labels = ValueLabels.of([whole, tails])
@@ -509,6 +511,33 @@ def test_value_loss_has_the_right_gradients():
     assert at_own == pytest.approx(ROUND, rel=1e-3)  # its least value
     for wrong in (replace(own, V_x=own.V_x * [1.0, 1.2]), replace(own, V=own.V * 1.1)):
         assert value_loss(net, wrong, np.array([0.5, 2.0]))(rows).item() > 2 * at_own
+
+
+@pytest.mark.parametrize(("name", "sizes"), [("pendulum", (8, 8)), ("cartpole", (13, 9, 5)), ("quadrotor", (24,))])
+def test_the_compiled_value_loss_is_that_of_autograd(name, sizes):
+    """In float64, over more rows than fill the lanes, one of them twice, a floor below zero."""
+    ocp, rng = nocl.load_ocp(name), np.random.default_rng(3)
+    x, t = rng.standard_normal((50, ocp.system.nx)), rng.uniform(0, ocp.horizon, 50)
+    labels = ValueLabels(x, t, rng.standard_normal(50), rng.standard_normal(x.shape))
+    torch.manual_seed(0)
+    net, rows = value_net(ocp, labels, sizes).double(), torch.tensor([*range(0, 50, 2), 3, 3, *range(1, 20, 3)])
+    answers = []
+    for compiled in (True, False):
+        net.zero_grad()
+        value = value_loss(net, labels, np.linspace(0.5, 2, ocp.system.nx), compiled=compiled)(rows)
+        value.backward()
+        answers.append(torch.cat([value.detach()[None], *(p.grad.flatten() for p in net.parameters())]))
+    torch.testing.assert_close(answers[0], answers[1], rtol=1e-10, atol=1e-12)
+
+
+def test_without_a_compiler_v_is_fitted_in_torch_and_that_is_told(monkeypatch):
+    ocp, labels = nocl.load_ocp("double_integrator"), riccati_labels(50)
+    net, rows = value_net(ocp, labels, (8,)), torch.arange(50)
+    compiled = value_loss(net, labels, np.ones(2))(rows)
+    monkeypatch.setenv("CC", "no-such-compiler")
+    with pytest.warns(UserWarning, match="V is fitted in torch, several times slower: no C compiler found"):
+        plain = value_loss(net, labels, np.ones(2))(rows)
+    assert plain.item() == pytest.approx(compiled.item(), rel=1e-5)
 
 
 def test_a_loss_that_is_not_finite_stops_the_fit():

@@ -13,8 +13,8 @@ from nocl import comparisons
 from nocl.solvers.cnd import TrainSettings
 
 README = Path(__file__).parents[1] / "README.md"
-SMALL = TrainSettings(seeds=4, starts=4, states=20, tails=60, visits=40, rounds=1, iterations=60, value_iterations=40,
-                      held_out=8, hidden=(16, 16))
+SMALL = TrainSettings(seeds=4, starts=4, states=20, tails=60, visits=40, rounds=1, iterations=60, value_initial=10,
+                      value_iterations=40, held_out=8, hidden=(16, 16))
 
 
 def blocks() -> list[str]:

@@ -25,10 +25,11 @@ class TrainSettings:
     hidden: tuple[int, ...] = (64, 64, 64)
     control_dt: bool = False  # True: u(x, t, dt), optimal in continuous time and held for dt; see CND.at_rate
     value: bool = True  # whether to train V(x, t) too
-    value_tails: int = 6000  # solved for V, from the tube and from the policy's own answers
+    value_initial: int = 1500  # initial states solved for V, from the nearest solutions and the policy's own answers
+    value_tails: int = 6000  # tails solved for it, from the tube
     value_visits: int = 3000  # more of them, from states that the policy visits under kicks
-    value_iterations: int = 4500
-    value_rounds: int = 2  # fits of V at most: each further one on as many labels more, twice as long, larger batches
+    value_iterations: int = 7000  # of the first fit of V; twice as many of further ones
+    value_rounds: int = 3  # fits of V at most: each further one on as many labels more
     value_error: float = 4e-3  # stop once met: mean of |V - J*| / J* at held-out initial, tube and kicked states
     held_out: int = 64  # initial states that tell when to stop
     gap_median: float = 2e-4  # stop once both are met: (J - J*) / J*, median over the held-out states,

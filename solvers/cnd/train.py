@@ -237,7 +237,7 @@ class _Training:
         return bool(last["gap_median"] <= s.gap_median and last["gap_p95"] <= s.gap_p95)
 
     def _value(self) -> FeatureNet:
-        """V, fitted once more on twice the labels where the held-out states ask for it; the better fit is kept."""
+        """V, fitted again on more labels where the held-out states ask for it; the best fit is kept."""
         s, rng, losses, tried = self.settings, self._rng(2_000_000), list[float](), list[float]()
         labels, optima = ValueLabels.of(on_fine_grid(self.fine, self.bank.solution)), self._value_optima()
         for attempt in range(s.value_rounds):
@@ -278,21 +278,19 @@ class _Training:
     def _value_labels(self, rng: np.random.Generator) -> ValueLabels:
         s = self.settings
         with self._stage("value labels", 1) as bar:
-            found = value_tails(self.ddp, self.bank, self.policy, self.f, tails=s.value_tails, visits=s.value_visits,
-                                width=s.width, kick=s.kick, rng=rng)
+            found = value_tails(self.ddp, self.bank, self.policy, self.f, initial=s.value_initial, tails=s.value_tails,
+                                visits=s.value_visits, width=s.width, kick=s.kick, rng=rng)
             labels = ValueLabels.of(on_fine_grid(self.fine, found))
             bar.update()
         return labels
 
     def _fit_value(self, net: FeatureNet, labels: ValueLabels, attempt: int) -> list[float]:
         s = self.settings
-        iterations, batch = s.value_iterations, s.batch // 2 or 1
-        if attempt:
-            iterations, batch = 2 * iterations, s.batch
-        loss = value_loss(net, labels, self.bank.scale)
+        iterations = s.value_iterations * (2 if attempt else 1)
+        loss = value_loss(net.float(), labels, self.bank.scale)
         with self._stage("value function" + (", once more" if attempt else ""), iterations, fits=True) as bar:
             report = _Reporter(bar, iterations)
-            fit(net, loss, len(labels), iterations=iterations, batch=batch, lr=s.lr, seed=self.seed + attempt,
+            fit(net, loss, len(labels), iterations=iterations, batch=s.batch, lr=s.lr, seed=self.seed + attempt,
                 report=report)
         return report.kept
 

@@ -6,8 +6,10 @@ horizon V = G is one where G is a sum of squares, and V never falls below what c
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -15,6 +17,7 @@ import torch
 from torch import Tensor
 
 from nocl.checks import Array
+from nocl.kernels import NoCompilerError
 from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.bank import SolutionBank
@@ -22,6 +25,7 @@ from nocl.solvers.cnd.features import features
 from nocl.solvers.cnd.labels import Field, answered, kicked_states, tube_states
 from nocl.solvers.cnd.regress import Loss
 from nocl.solvers.cnd.validate import refined
+from nocl.solvers.cnd.value_kernel import ValueKernel
 from nocl.solvers.ddp import DDP, DDPSolution
 from nocl.to_torch import to_torch
 
@@ -61,12 +65,15 @@ class ValueLabels:
         return ValueLabels(*(np.concatenate([getattr(p, n) for p in parts]) for n in ValueLabels.__dataclass_fields__))
 
 
-def value_tails(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, *, tails: int, visits: int,
-                width: float, kick: float, rng: np.random.Generator) -> DDPSolution:
-    """Tails from states of the tube and from those that the policy visits under kicks."""
-    _, t0, x = tube_states(bank, tails, width, ddp.ocp.horizon, rng)
+def value_tails(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, *, initial: int, tails: int,
+                visits: int, width: float, kick: float, rng: np.random.Generator) -> DDPSolution:
+    """Solutions from initial states, and tails from states of the tube and from those that the policy visits under
+    kicks."""
+    x0 = ddp.ocp.initial_states.sample(initial, rng)
+    _, t_tube, x_tube = tube_states(bank, tails, width, ddp.ocp.horizon, rng)
     x_kicked, t_kicked = kicked_states(ddp.ocp, bank, policy, f, visits, kick, rng)
-    return answered(ddp, bank, policy, f, np.concatenate([x, x_kicked]), np.concatenate([t0, t_kicked]))
+    x, t = np.concatenate([x0, x_tube, x_kicked]), np.concatenate([np.zeros(initial), t_tube, t_kicked])
+    return answered(ddp, bank, policy, f, x, t)
 
 
 def on_fine_grid(fine: DDP, coarse: DDPSolution) -> Iterator[DDPSolution]:
@@ -91,31 +98,48 @@ def _floor(labels: ValueLabels) -> float:
     return 0.0 if least >= 0 else least - float(labels.V.std())
 
 
-def value_loss(net: FeatureNet, labels: ValueLabels, scale: Array, slope_weight: float = 0.1) -> Loss:
+def value_loss(net: FeatureNet, labels: ValueLabels, scale: Array, slope_weight: float = 0.1, *,
+               compiled: bool = True) -> Loss:
     """Mean norm of the relative errors of V - floor and of its gradient, states in units of `scale` [nx].
 
-    Relative, because V and its gradient differ by orders of magnitude between the start and the end of a horizon.
+    Relative, because V and its gradient differ by orders of magnitude between the start and the end of a horizon. In C,
+    or in torch where it is not to be `compiled` or there is no C compiler, which is told: the same to rounding.
     """
-    x, t = torch.from_numpy(labels.x).float(), torch.from_numpy(labels.t).float()[:, None]
+    kind, (floor, unit) = next(net.parameters()).dtype, _units(net)
     phi, slope, rows_of, columns = _features_and_slopes(net, labels, scale)
-    V, V_x = torch.from_numpy(labels.V).float()[:, None], torch.from_numpy(labels.V_x * scale).float()
-    size, steepness = V - _floor(labels), V_x.square().sum(1, keepdim=True)
-    per_V, per_slope = ((1 / (a + SMALL * a.median())) for a in (size, steepness))
+    V = torch.from_numpy((labels.V - floor) / unit)[:, None]
+    V_x = torch.from_numpy(labels.V_x * scale / unit)
+    per_V, per_slope = (1 / (a + SMALL * a.median()) for a in (V.clamp(min=0), V_x.square().sum(1, keepdim=True)))
+    parts = [phi, slope, V_x, V, per_V, slope_weight * per_slope]
+    phi, slope, V_x, V, per_V, per_slope = (part.to(kind) for part in parts)
+    mlp = cast(MLP, net.nets[0])
+    if compiled:
+        try:
+            return ValueKernel(mlp, phi, slope, rows_of, columns, V_x, V, per_V, per_slope, ROUND)
+        except NoCompilerError as error:
+            warnings.warn(f"V is fitted in torch, several times slower: {error}", stacklevel=2)
 
     def loss(rows: Tensor) -> Tensor:
         p = phi[rows].requires_grad_(True)
-        answer = net.combine((x[rows], t[rows]), [net.nets[0](p)])
+        answer = mlp(p).square().sum(1, keepdim=True)
         (by_phi,) = torch.autograd.grad(answer.sum(), p, create_graph=True)
         gradient = torch.zeros_like(V_x[rows]).index_add(1, columns, by_phi[:, rows_of] * slope[rows])
         off = (gradient - V_x[rows]).square().sum(1, keepdim=True) * per_slope[rows]
-        square = ((answer - V[rows]) * per_V[rows]).square() + slope_weight * off
+        square = ((answer - V[rows]) * per_V[rows]).square() + off
         return (square + ROUND**2).sqrt().mean()
 
     return loss
 
 
+def _units(net: FeatureNet) -> tuple[float, float]:
+    """(floor, unit) of a value network: V = floor + unit |y|^2."""
+    x, y = np.zeros(net.outputs.size1_in(0)), np.eye(net.outputs.size1_in(2))[0]
+    floor, above = (float(net.outputs(x, 0.0, at)) for at in (0 * y, y))
+    return floor, above - floor
+
+
 def _features_and_slopes(net: FeatureNet, labels: ValueLabels, scale: Array) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """phi [n, F] of all labels in float32, and d phi / d (x / scale) as nonzeros [n, nz] with their rows, columns."""
+    """phi [n, F] of all labels, and d phi / d (x / scale) as nonzeros [n, nz] with their rows, columns."""
     x, t = (ca.SX.sym(n, net.inputs.size1_in(i)) for i, n in enumerate("xt"))
     phi = net.inputs(x, t)
     J = ca.jacobian(phi, x)
@@ -125,4 +149,4 @@ def _features_and_slopes(net: FeatureNet, labels: ValueLabels, scale: Array) -> 
     with torch.no_grad():
         parts = [both(X[i:i + CHUNK], T[i:i + CHUNK]) for i in range(0, len(X), CHUNK)]
     values, slopes = (torch.cat([p[i] for p in parts]) for i in range(2))
-    return values.float(), (slopes * torch.from_numpy(scale)[columns]).float(), rows, columns
+    return values, slopes * torch.from_numpy(scale)[columns], rows, columns
