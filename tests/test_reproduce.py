@@ -91,6 +91,6 @@ def test_the_command(made, capsys):
     words = ["reproduce", "sysid", "--quick", "--iterations", "3", "--seeds", "2", "--systems", "dubins", "--ways",
              ",".join(TINY.ways), "--out", str(folder)]
     assert cli.main(words) == 0
-    assert "| dubins | ReLU (without gradients) | 3," in capsys.readouterr().out
+    assert "| dubins | ReLU (without gradients) | 3 x 256, 128 wide; " in capsys.readouterr().out
     assert cli.main(["reproduce", "sysid", "--systems", "mars", "--out", str(folder)]) == 2
     assert cli.main(["reproduce"]) == 2

@@ -7,7 +7,7 @@ no structure, no sines and cosines of angles) and nocl's recipe.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -173,7 +173,7 @@ class Entry:
     jacobian: float
     seconds: float
     seeds: int
-    iterations: str  # of Adam in the paper's ways, of SOAP in nocl's; blank: as `identify` chooses
+    made: str  # steps x batch and width; blank: as `identify` chooses
 
     @staticmethod
     def of(cells: Sequence[Cell]) -> Entry:
@@ -186,7 +186,13 @@ class Entry:
         return Entry(over(means), over(c.score.std for c in cells), over(c.score.median for c in cells),
                      over(c.score.iqr for c in cells), min(means), max(means), over(c.score.jacobian for c in cells),
                      over(c.seconds for c in cells), len(cells),
-                     " ".join(sorted({str(c.settings.get("iterations", "")) for c in cells})))
+                     "; ".join(sorted({_made(c.settings) for c in cells})))
+
+
+def _made(settings: Mapping[str, Any]) -> str:
+    given = {name: settings.get(name) for name in ("iterations", "batch", "width")}
+    steps = " x ".join(str(given[name]) for name in ("iterations", "batch") if given[name])
+    return steps + (f", {given['width']} wide" if given["width"] else "")
 
 
 def table(cells: Sequence[Cell]) -> dict[tuple[str, str], Entry]:

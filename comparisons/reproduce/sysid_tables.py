@@ -38,7 +38,7 @@ def _number(x: float) -> str:
 
 def markdown(entries: Table) -> str:
     """A block of rows for each system: ours, the spread over seeds, the paper's."""
-    lines = ["| system | network | iterations, seconds | mean ± s.d. | median (iqr) | mean of the seeds, from .. to "
+    lines = ["| system | network | steps x batch, width; seconds | mean ± s.d. | median (iqr) | mean of the seeds "
              "| paper: mean ± s.d. | paper: median (iqr) | ours / paper's |", f"|{'---|' * 9}"]
     for system in _systems(entries):
         for way in WAYS:
@@ -48,7 +48,7 @@ def markdown(entries: Table) -> str:
             theirs = ["", "", ""] if paper is None else [
                 f"{_number(paper[0])} ± {_number(paper[1])}", f"{_number(paper[2])} ({_number(paper[3])})",
                 f"{entry.mean / paper[0]:.2f}"]
-            cells = [system, way.title, f"{entry.iterations}, {entry.seconds:.0f}".lstrip(", "),
+            cells = [system, way.title, f"{entry.made}; {entry.seconds:.0f}".lstrip("; "),
                      f"{_number(entry.mean)} ± {_number(entry.std)}",
                      f"{_number(entry.median)} ({_number(entry.iqr)})",
                      f"{_number(entry.lowest)} .. {_number(entry.highest)}", *theirs]
