@@ -11,6 +11,7 @@ import argparse
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +30,10 @@ from nocl.systems import load_ocp
 
 BATCH, WIDTH, ROWS = 1024, 64, 100_000
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-LABELS = (100, 300, 1000, 3000, 10_000, 30_000, 100_000)
-SMALL = Settings(width=32, iterations=800, batch=512, polish=30, polish_batch=512)  # the same at every number of labels
+LABELS = (100, 300, 1000, 3000, 10_000, 30_000, 100_000, 1_000_000)
+# the same at every number of labels, with and without gradients
+BUDGETS = {"default": Settings(width=24, iterations=2000, batch=512, polish=10, polish_batch=512),
+           "mlp": Settings(width=64, iterations=4000, batch=512, polish=0)}
 
 Step = Callable[[], None]
 
@@ -109,24 +112,47 @@ def _loop(mlp: MLP, z: Tensor) -> tuple[Tensor, Tensor]:
 
 def samples(systems: list[str], labels: list[int]) -> None:
     """Mean error of nocl's recipe and of the plain network, with and without Jacobian labels, on the same rows."""
-    rows: list[dict[str, Any]] = []
-    for name in systems:
+    kept, rows = provenance.RESULTS / "sysid_samples.json", list[dict[str, Any]]()
+    if kept.exists():
+        rows = [r for r in store.read_json(kept)["rows"] if (r["system"], r["labels"]) not in product(systems, labels)]
+    for name, n in product(systems, labels):
         system = load_ocp(name).system
-        for n in labels:
-            data = Dataset.sample(system, n, 7)
-            for method in ("default", "mlp"):
-                for gradients in (True, False):
-                    model = identify(system, data=data, method=method, gradients=gradients, settings=SMALL,
-                                     progress=False)
-                    score = model.score(5000)
-                    rows.append({"system": name, "labels": n, "method": method, "gradients": gradients,
-                                 "mean": score.mean, "median": score.median, "jacobian": score.jacobian,
-                                 "seconds": model.card["seconds"]})
-                    print(rows[-1], flush=True)
-    kept = provenance.RESULTS / "sysid_samples.json"
-    others = [r for r in store.read_json(kept)["rows"] if r["system"] not in systems] if kept.exists() else []
-    provenance.write("sysid_samples", [*others, *rows], settings=asdict(SMALL))
-    draw([*others, *rows], DOCS / "sysid_samples.png")
+        data = Dataset.sample(system, n, 7)
+        for method, gradients in product(BUDGETS, (True, False)):
+            model = identify(system, data=data, method=method, gradients=gradients, settings=BUDGETS[method],
+                             progress=False)
+            score = model.score(5000)
+            rows.append({"system": name, "labels": n, "method": method, "gradients": gradients, "mean": score.mean,
+                         "median": score.median, "jacobian": score.jacobian, "seconds": model.card["seconds"]})
+            print(rows[-1], flush=True)
+        rows.sort(key=lambda r: (r["system"], r["labels"]))
+        savings = [s for pair in sorted({(r["system"], r["method"]) for r in rows}) for s in saved(rows, *pair)]
+        provenance.write("sysid_samples", rows, savings=savings, settings={k: asdict(s) for k, s in BUDGETS.items()})
+        draw(rows, DOCS / "sysid_samples.png")
+    for saving in savings:
+        print(saving)
+
+
+def saved(rows: list[dict[str, Any]], system: str, method: str) -> list[dict[str, Any]]:
+    """For each number of labels with Jacobians, how many without reach the same error, in multiples of it.
+
+    Log-interpolated between measured numbers of labels; `at_least` where the most that were tried do not reach it.
+    """
+    with_, without = ([(r["labels"], r["mean"]) for r in rows if (r["system"], r["method"], r["gradients"]) ==
+                       (system, method, gradients)] for gradients in (True, False))
+    return [{"system": system, "method": method, "labels": n, "mean": error, "at_least": needed is None,
+             "times": round((needed or without[-1][0]) / n, 2)}
+            for n, error in with_ for needed in [_needed(without, error)]]
+
+
+def _needed(curve: list[tuple[int, float]], error: float) -> float | None:
+    """The first number of labels at which a curve of (labels, error) comes down to an error."""
+    if curve[0][1] <= error:
+        return curve[0][0]
+    for (n, above), (m, below) in pairwise(curve):
+        if below <= error:
+            return float(n * (m / n) ** (np.log(above / error) / np.log(above / below)))
+    return None
 
 
 def draw(rows: list[dict[str, Any]], path: Path) -> None:
