@@ -32,7 +32,7 @@ BATCH, WIDTH, ROWS = 1024, 64, 100_000
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 LABELS = (100, 300, 1000, 3000, 10_000, 30_000, 100_000, 1_000_000)
 # the same at every number of labels, with and without gradients
-BUDGETS = {"default": Settings(width=24, iterations=2000, batch=512, polish=10, polish_batch=512),
+BUDGETS = {"default": Settings(width=32, iterations=3000, batch=512, polish=30, polish_batch=512),
            "mlp": Settings(width=64, iterations=4000, batch=512, polish=0)}
 
 Step = Callable[[], None]
