@@ -365,7 +365,7 @@ class Entry:
     cost_low: float
     cost_high: float
     failed: int  # runs
-    seconds: float  # means over the seeds
+    seconds: float  # means over the seeds that tell
     cpu: float
     identify: float
     evaluations: float
@@ -389,8 +389,9 @@ def _entry(problem: str, way: str, cells: Sequence[Cell]) -> Entry:
         numbers |= {what: mean, f"{what}_std": std, f"{what}_low": low, f"{what}_high": high}
     del numbers["cost_std"]
     for what in ("seconds", "cpu", "identify", "evaluations", "ms"):
-        numbers[what] = float(np.mean([getattr(c, what) for c in cells])) if cells else math.nan
-    made = " ".join(dict.fromkeys(c.made for c in cells)) or "not run yet"
+        known = [value for c in cells if not math.isnan(value := getattr(c, what))]
+        numbers[what] = float(np.mean(known)) if known else math.nan
+    made = "; ".join(dict.fromkeys(c.made for c in cells)) or "not run yet"
     return Entry(problem, way, **numbers, failed=sum(int((~np.isfinite(c.error)).sum()) for c in judged),
                  n=max((len(c.error) for c in judged), default=0), seeds=len(cells), made=made)
 

@@ -42,6 +42,11 @@ def _way(e: Entry, name: str) -> tuple[Way, Published | None]:
     return way, way.paper.get(e.problem)
 
 
+def _trained_on(way: Way) -> str:
+    """Rivals that have not been run learn models of their own."""
+    return "its own model" if way.make is None else "f_theta" if way.learned else "f"
+
+
 def _number(x: float, digits: int = 3) -> str:
     """So many digits, plain where that is readable; blank for NaN."""
     if not math.isfinite(x):
@@ -65,7 +70,7 @@ def markdown(entries: Sequence[Entry], name: str) -> str:
             "" if paper.evaluations is None else f"{paper.evaluations}"]
         seeds = [_pair(*pair, "{} .. {}") if e.seeds > 1 else "" for pair in
                  ((e.error_low, e.error_high), (e.magnitude_low, e.magnitude_high))]
-        row = [e.problem, way.title, "f_theta" if way.learned else "f", _pair(e.error, e.error_std), seeds[0],
+        row = [e.problem, way.title, _trained_on(way), _pair(e.error, e.error_std), seeds[0],
                _pair(e.magnitude, e.magnitude_std), seeds[1], _number(e.cost), f"{e.failed}" if e.n else "",
                _number(e.evaluations), took, _number(e.ms), f"{e.seeds} x {e.n}" if e.n else "", e.made, *theirs]
         lines.append(f"| {' | '.join(row)} |")
@@ -83,7 +88,7 @@ def latex(entries: Sequence[Entry], name: str) -> str:
         row = {e.problem: e for e in entries if e.way == key}
         if not row:
             continue
-        ours = [way.title.replace("CND (R = 0)", "CND ($R = 0$)"), r"$f_\theta$" if way.learned else "$f$"]
+        ours = [way.title.replace("CND (R = 0)", "CND ($R = 0$)"), _dynamics(way)]
         theirs = [r"\quad paper", ""]
         for problem in problems:
             e, paper = row.get(problem), way.paper.get(problem)
@@ -111,7 +116,7 @@ def as_csv(entries: Sequence[Entry], name: str) -> str:
         way, paper = _way(e, name)
         theirs = [""] * len(names) if paper is None else ["" if v is None else v for v in astuple(paper)]
         ours = ["" if isinstance(v, float) and math.isnan(v) else v for v in asdict(e).values()]
-        writer.writerow(["f_theta" if way.learned else "f", *ours, *theirs])
+        writer.writerow([_trained_on(way), *ours, *theirs])
     return file.getvalue()
 
 
@@ -144,7 +149,7 @@ def figure(entries: Sequence[Entry], name: str) -> Figure:
 
 
 def _dynamics(way: Way) -> str:
-    return r"$f_\theta$" if way.learned else "$f$"
+    return {"f": "$f$", "f_theta": r"$f_\theta$"}.get(trained := _trained_on(way), trained)
 
 
 def _dots(axes: Axes, entries: dict[str, Entry], ways: dict[str, Way], problem: str) -> None:
