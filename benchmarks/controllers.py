@@ -34,21 +34,43 @@ from nocl.comparisons.reference import SLOTS, resolved
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
 from nocl.simulate import Simulation, simulate
-from nocl.solvers.bank import better
+from nocl.solvers.bank import SolutionBank, better
+from nocl.solvers.cnd import TrainSettings
 from nocl.solvers.cnd.labels import policy_controls
+from nocl.solvers.cnd.validate import feasible, kicked_optima, tube_optima, value_scores
 from nocl.solvers.ddp import DDP, DDPSolution
 from nocl.solvers.global_search import cold_controls, solve_globally
 
 FINE = 640  # intervals of the reference
 COLD = 48  # cold starts from each of the worst states
+VALUE_STATES = 2048  # of the tube, and of kicked rollouts, on which V is judged
 
 
-def optimum(ocp: OCP, x0: Array, policy: FeatureNet) -> DDPSolution:
-    """The best solutions known from x0, on FINE intervals."""
+def optimum(ocp: OCP, x0: Array, policy: FeatureNet) -> tuple[DDPSolution, SolutionBank]:
+    """The best solutions known from x0, on FINE intervals; those found on the usual grid as a bank."""
     coarse, fine = DDP(ocp), DDP(ocp, intervals=FINE)
     found = solve_globally(coarse, x0, starts=8, seed=99).best
     own = policy_controls(policy, nocl.to_torch(ocp.system.f), x0, np.zeros(len(x0)), ocp.horizon, FINE)
-    return better(fine.solve(x0, u=np.repeat(found.u, FINE // coarse.intervals, axis=1)), fine.solve(x0, u=own))
+    best = better(fine.solve(x0, u=np.repeat(found.u, FINE // coarse.intervals, axis=1)), fine.solve(x0, u=own))
+    return best, SolutionBank.of(coarse, found[found.success])
+
+
+def value_errors(ocp: OCP, cnd: nocl.CND, bank: SolutionBank, n: int, seed: int) -> dict[str, float]:
+    """Mean |V - J*| / |J*|, and V_x against costates (medians), on n states of the tube about the bank's trajectories
+    and n of the controller's own kicked rollouts, solved anew; none of them is among those that training drew. States
+    that cannot hold the path constraints are left out."""
+    f, fine, rng = nocl.to_torch(ocp.system.f), DDP(ocp, intervals=FINE // 2), np.random.default_rng(seed)
+    usual = TrainSettings()
+    sets = {"tube": tube_optima(DDP(ocp), fine, bank, cnd.policy, f, n, usual.width, rng),
+            "tails": kicked_optima(DDP(ocp), fine, bank, cnd.policy, f, n, usual.kick, rng)}
+    sets = {where: feasible(ocp, s) for where, s in sets.items()}
+    found, row = value_scores(ocp, cnd.value_net, cnd.policy, f, sets), {}
+    for where, s in sets.items():
+        row |= {f"value_error_{where}_%": round(100 * found[f"{where}_error"], 3),
+                f"value_gradient_{where}_degrees": round(found[f"{where}_degrees"], 3),
+                f"value_slope_error_{where}_%": round(100 * found[f"{where}_slope_error"], 3),
+                f"value_judged_{where}": len(s)}
+    return row
 
 
 def cost_of_kicks(ocp: OCP, policy: FeatureNet, run: Simulation, kicks: list[tuple[int, Array]]) -> Array:
@@ -84,7 +106,7 @@ def score(ocp: OCP, cnd: nocl.CND, n: int, sigma: float, seed: int = 12345) -> d
     """The row of one controller."""
     rng = np.random.default_rng(seed)
     x0 = ocp.initial_states.sample(n, rng)
-    best = optimum(ocp, x0, cnd.policy)
+    best, bank = optimum(ocp, x0, cnd.policy)
     run, known = simulate(ocp, cnd, x0), best.success
     gap = np.where(known, run.cost / best.cost - 1, -np.inf)
     row = {"failed": int((~run.success).sum()), "unsolved": int((~known).sum()),
@@ -104,8 +126,7 @@ def score(ocp: OCP, cnd: nocl.CND, n: int, sigma: float, seed: int = 12345) -> d
     V = cnd.value(x0, 0.0)
     row["value_error_%"] = round(100 * float(np.mean(np.abs(V / best.cost - 1))), 3)
     cosine = _cosine(cnd.value_gradient(x0, 0.0), best.V_x[:, 0])
-    for where in ("tube", "tails"):  # states of the tube and of kicked rollouts that training did not see
-        row[f"value_error_{where}_%"] = round(100 * cnd.card["value"][f"{where}_error"], 3)
+    row |= value_errors(ocp, cnd, bank, VALUE_STATES, seed + 1)
     row["value_gradient_degrees"] = round(float(np.degrees(np.median(np.arccos(np.clip(cosine, -1, 1))))), 2)
     return row
 
@@ -120,7 +141,9 @@ def trained(ocp: OCP, dynamics: str, seed: int, keep: Path | None) -> tuple[nocl
     clock, cpu = time.perf_counter(), time.process_time()
     cnd = nocl.train(ocp, model, seed=seed)
     clock, cpu = time.perf_counter() - clock, time.process_time() - cpu
-    return (cnd.rounded() if keep else cnd), {"train_seconds": round(clock, 1), "train_cpu_seconds": round(cpu, 1)}
+    times = {"train_seconds": round(clock, 1), "train_cpu_seconds": round(cpu, 1)}
+    times |= {name: cnd.card[name] for name in ("fitting_seconds", "fitting_cpu_seconds")}
+    return (cnd.rounded() if keep else cnd), times
 
 
 COLUMNS = {"gap: median, %": ("gap", "median_%"), "95th percentile": ("gap", "p95_%"),

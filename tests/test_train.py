@@ -530,6 +530,18 @@ def test_the_compiled_value_loss_is_that_of_autograd(name, sizes):
     torch.testing.assert_close(answers[0], answers[1], rtol=1e-10, atol=1e-12)
 
 
+def test_the_compiled_value_loss_refuses_what_it_was_not_made_for():
+    ocp, labels = nocl.load_ocp("double_integrator"), riccati_labels(50)
+    net = value_net(ocp, labels, (8,)).float()
+    loss = value_loss(net, labels, np.ones(2))
+    for rows in ([50], [-1], []):
+        with pytest.raises(IndexError, match="the loss of V has 50 labels; got"):
+            loss(torch.tensor(rows, dtype=torch.int64))
+    net.double()
+    with pytest.raises(ValueError, match="made for weights in float32; got float64: make it again after"):
+        loss(torch.arange(5))
+
+
 def test_without_a_compiler_v_is_fitted_in_torch_and_that_is_told(monkeypatch):
     ocp, labels = nocl.load_ocp("double_integrator"), riccati_labels(50)
     net, rows = value_net(ocp, labels, (8,)), torch.arange(50)

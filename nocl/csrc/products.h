@@ -34,6 +34,9 @@ typedef double real;
 typedef real vec __attribute__((vector_size(BYTES)));
 
 INLINE vec of(real value) { return value - (vec){0}; }
+#if BYTES == 16 && !SINGLE
+INLINE real sum_of(vec x) { return x[0] + x[1]; }
+#else
 typedef real quarter __attribute__((vector_size(BYTES / 4)));
 INLINE real sum_of(vec x)
 {
@@ -43,6 +46,7 @@ INLINE real sum_of(vec x)
     for (int i = 0; i < LANES / 4; ++i) sum += four[i];
     return sum;
 }
+#endif
 
 #if BYTES == 64 && SINGLE
 #define EVEN {0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22, 24, 26, 28, 30}

@@ -44,5 +44,6 @@ class TrainSettings:
                 raise ValueError(f"TrainSettings: {f.name} is {value!r}; expected a positive number")
             if f.type == "bool" and not isinstance(value, bool):
                 raise ValueError(f"TrainSettings: {f.name} is {value!r}; expected True or False")
-        if not self.hidden or not all(isinstance(h, int) and h > 0 for h in self.hidden):
+        widths = self.hidden if isinstance(self.hidden, (tuple, list)) else ()
+        if not widths or not all(isinstance(h, int) and not isinstance(h, bool) and h > 0 for h in widths):
             raise ValueError(f"TrainSettings: hidden is {self.hidden!r}; expected widths such as (64, 64, 64)")

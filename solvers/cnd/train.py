@@ -132,7 +132,7 @@ class _Training:
         self.fine = DDP(ocp, intervals=4 * settings.intervals, dynamics=dynamics)
         self.checkpoint = None if out is None else Path(out) / CHECKPOINT
         self.hidden_progress = None if progress is None else not progress
-        self.round, self.seconds, self.fitting, self.evaluations = 0, 0.0, 0.0, 0
+        self.round, self.seconds, self.fitting, self.fitting_cpu, self.evaluations = 0, 0.0, 0.0, 0.0, 0
         self.history: list[dict[str, Any]] = []
         self.losses: list[float] = []
         self.value_card: dict[str, Any] = {}
@@ -247,7 +247,8 @@ class _Training:
                     net = value_net(self.ocp, labels, s.hidden)
             losses += self._fit_value(net, labels, attempt)
             scores = value_scores(self.ocp, net, self.policy, self.f, optima)
-            tried.append(float(np.max([scores[f"{name}_error"] for name in optima])))
+            worst = float(np.max([scores[f"{name}_error"] for name in optima]))
+            tried.append(worst if np.isfinite(worst) else np.inf)
             if len(tried) == 1 or tried[-1] < min(tried[:-1]):
                 best, weights = scores, copy.deepcopy(net.state_dict())
             if tried[-1] <= s.value_error:
@@ -257,7 +258,8 @@ class _Training:
             warnings.warn(f"{self.ocp.system.name}: V is {100 * min(tried):.2g} % off in the mean on held-out states; "
                           "expected less than 5 %: try TrainSettings with more value_tails or value_iterations, wider "
                           "layers, or a narrower tube (width)", stacklevel=5)
-        self.value_card = {"loss": losses, "labels": len(labels), "tried": tried, **best}
+        judged = {f"{name}_judged": len(held) for name, held in optima.items()}
+        self.value_card = {"loss": losses, "labels": len(labels), "tried": tried, **judged, **best}
         return net
 
     def _value_optima(self) -> dict[str, DDPSolution]:
@@ -297,8 +299,10 @@ class _Training:
     def _card(self) -> dict[str, Any]:
         last = self.history[-1]
         return {"method": "default", "dynamics": "learned" if self.learned else "exact", "seed": self.seed,
-                "gap_median": last["gap_median"], "gap_p95": last["gap_p95"], "seconds": round(self.seconds, 1),
+                **{name: last[name] for name in ("gap_median", "gap_p95", "kicked_median", "kicked_p95", "unsolved")},
+                "seconds": round(self.seconds, 1),
                 "fitting_seconds": round(self.fitting, 1),  # of these, fits of networks; the others solve problems
+                "fitting_cpu_seconds": round(self.fitting_cpu, 1),
                 "dynamics_evaluations": self._evaluations(),
                 "settings": asdict(self.settings), "history": self.history, "value": self.value_card}
 
@@ -308,11 +312,12 @@ class _Training:
 
     @contextmanager
     def _stage(self, name: str, total: int, fits: bool = False) -> Iterator[tqdm[Any]]:
-        start = time.perf_counter()
+        start, cpu = time.perf_counter(), time.process_time()
         with tqdm(total=total, desc=name, disable=self.hidden_progress, leave=True) as bar:
             yield bar
         took = time.perf_counter() - start
         self.seconds, self.fitting = self.seconds + took, self.fitting + took * fits
+        self.fitting_cpu += (time.process_time() - cpu) * fits
 
     def _rng(self, stage: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, stage, STREAM])
@@ -326,7 +331,7 @@ class _Training:
         state = {"policy": self.net.state_dict(), "labels": _tensors(vars(self.labels)),
                  "bank": _tensors({k: v for k, v in vars(self.bank.solution).items() if k != "message"})}
         meta = {"identity": self._identity(), "round": self.round, "history": self.history, "seconds": self.seconds,
-                "fitting": self.fitting,
+                "fitting": self.fitting, "fitting_cpu": self.fitting_cpu,
                 "first": self.first, "evaluations": self._evaluations()}
         self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
         store.save_checkpoint(self.checkpoint, state, meta)
@@ -341,7 +346,7 @@ class _Training:
         self.labels = Labels(**_arrays(state["labels"]))
         self.bank = SolutionBank.from_arrays(self.ddp, _arrays(state["bank"]))
         self.round, self.history, self.first = meta["round"], meta["history"], meta["first"]
-        self.seconds, self.fitting = meta["seconds"], meta["fitting"]
+        self.seconds, self.fitting, self.fitting_cpu = meta["seconds"], meta["fitting"], meta["fitting_cpu"]
         self.evaluations = meta.get("evaluations", 0)
         self._network()
         self.net.double().load_state_dict(state["policy"])

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from nocl.kernels import Kernel
 from nocl.nets import MLP
@@ -44,6 +45,12 @@ class ValueKernel:
 
     def value_and_gradient(self, rows: NDArray[np.int64], theta: NDArray[Any]) -> tuple[float, NDArray[Any]]:
         """The loss, and its gradient [P] in the weights theta [P]."""
+        if theta.dtype != self.labels.dtype:
+            raise ValueError(f"the loss of V was made for weights in {self.labels.dtype}; got {theta.dtype}: make it "
+                             "again after net.float() or net.double()")
+        if len(rows) == 0 or rows.min() < 0 or rows.max() >= len(self.labels):
+            raise IndexError(f"the loss of V has {len(self.labels)} labels; got {len(rows)} row numbers"
+                             + (f" from {rows.min()} to {rows.max()}" if len(rows) else ""))
         value, gradient = np.empty(1), np.empty_like(theta)
         self.kernel("nocl_value_loss", rows, len(rows), theta, self.labels, *self.slopes, self.work, gradient, value)
         return float(value[0]), gradient
@@ -61,6 +68,7 @@ class _WithGradient(torch.autograd.Function):
         return torch.tensor(value, dtype=parameters[0].dtype)
 
     @staticmethod
+    @once_differentiable
     def backward(ctx: Any, bar: Tensor) -> Any:  # type: ignore[override]
         return (None, None, *(g * bar for g in ctx.gradients))
 
