@@ -30,7 +30,7 @@ class TrainSettings:
     value_visits: int = 3000  # more of them, from states that the policy visits under kicks
     value_iterations: int = 7000  # of the first fit of V; twice as many of further ones
     value_rounds: int = 3  # fits of V at most: each further one on as many labels more
-    value_error: float = 4e-3  # stop once met: mean of |V - J*| / J* at held-out initial, tube and kicked states
+    value_error: float = 2.5e-3  # stop once met: mean of |V - J*| / J* at held-out initial, tube and kicked states
     held_out: int = 64  # initial states that tell when to stop
     gap_median: float = 2e-4  # stop once both are met: (J - J*) / J*, median over the held-out states,
     gap_p95: float = 1e-3  # and its 95th percentile
