@@ -1,7 +1,7 @@
 """Trained controllers as feedback: the gap to the optimum in continuous time, on hidden states, and under kicks.
 
     python benchmarks/controllers.py [PROBLEM ...] [--dynamics exact learned] [--seeds 0 1 2] [--n 200]
-    python benchmarks/controllers.py "cartpole, wide box" van_der_pol --seeds 0 --results controllers_more
+    python benchmarks/controllers.py "cartpole, wide box" --dynamics exact --seeds 0 --results controllers_wide
     python benchmarks/controllers.py --table pretrained controllers      # the results of those files as markdown
 
 Every controller is judged by CVODES on the exact f, as continuous feedback, from initial states that training did not
@@ -10,6 +10,8 @@ see. J* is the continuous-time optimum: the best of DDP's cold starts, neighbour
 solved anew after each kick ("kicked_gap"). It then stands elsewhere than the controller when the next kick hits both,
 and kicks that come late cost the one or the other more by chance: "kicked_loss" leaves that out. It is what the
 controller loses between kicks, each stretch against the optimum from the state where the kick left the controller.
+
+V is judged on fresh states, too: the hidden initial ones, and VALUE_STATES of the tube and of kicked rollouts each.
 """
 
 from __future__ import annotations

@@ -344,7 +344,7 @@ def _key(plan: Plan, problem: str, name: str, seed: int) -> dict[str, Any]:
 
 def _read(path: Path) -> Cell:
     return read_cell(path, Cell, "the tables of control",
-                      ("error", "magnitude", "cost", "paths", "seconds", "cpu", "identify", "evaluations", "ms"))
+                     ("error", "magnitude", "cost", "paths", "seconds", "cpu", "identify", "evaluations", "ms"))
 
 
 @dataclass(frozen=True)
