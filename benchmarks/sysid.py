@@ -2,6 +2,7 @@
 
     python benchmarks/sysid.py speed      # samples per second beside plain PyTorch -> results/sysid_speed.json
     python benchmarks/sysid.py samples    # error by labels -> results/sysid_samples.json, docs/sysid_samples.png
+    python benchmarks/sysid.py drawn      # the same of labels that nocl draws itself, kept beside them
     python benchmarks/sysid.py table RUN  # the cells of `nocl reproduce sysid --out RUN` -> results/sysid.json
 """
 
@@ -24,15 +25,16 @@ from nocl import store
 from nocl.comparisons.reproduce import sysid
 from nocl.data import Dataset
 from nocl.nets import MLP
-from nocl.sysid import Settings, identify
+from nocl.sysid import LearnedDynamics, Settings, identify
 from nocl.sysid_loss import Loss
 from nocl.systems import load_ocp
 
 BATCH, WIDTH, ROWS = 1024, 64, 100_000
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-LABELS = (100, 300, 1000, 3000, 10_000, 30_000, 100_000, 1_000_000)
+LABELS = (100, 300, 1000, 3000, 10_000, 100_000, 1_000_000)
+DRAWN = (10, 200_000, 1_000_000)  # labels for the networks, at least 2,048 rows; those of the structure come beside
 # the same at every number of labels, with and without gradients
-BUDGETS = {"default": Settings(width=32, iterations=3000, batch=512, polish=30, polish_batch=512),
+BUDGETS = {"default": Settings(width=32, iterations=3000, batch=512, polish=100, polish_batch=512),
            "mlp": Settings(width=64, iterations=4000, batch=512, polish=0)}
 
 Step = Callable[[], None]
@@ -112,37 +114,59 @@ def _loop(mlp: MLP, z: Tensor) -> tuple[Tensor, Tensor]:
 
 def samples(systems: list[str], labels: list[int]) -> None:
     """Mean error of nocl's recipe and of the plain network, with and without Jacobian labels, on the same rows."""
-    kept, rows = provenance.RESULTS / "sysid_samples.json", list[dict[str, Any]]()
-    if kept.exists():
-        rows = [r for r in store.read_json(kept)["rows"] if (r["system"], r["labels"]) not in product(systems, labels)]
+    rows = [r for r in kept_samples() if (r["system"], r["labels"]) not in product(systems, labels)]
     for name, n in product(systems, labels):
         system = load_ocp(name).system
         data = Dataset.sample(system, n, 7)
         for method, gradients in product(BUDGETS, (True, False)):
             model = identify(system, data=data, method=method, gradients=gradients, settings=BUDGETS[method],
                              progress=False)
-            score = model.score(5000)
-            rows.append({"system": name, "labels": n, "method": method, "gradients": gradients, "mean": score.mean,
-                         "median": score.median, "jacobian": score.jacobian, "seconds": model.card["seconds"]})
-            print(rows[-1], flush=True)
-        rows.sort(key=lambda r: (r["system"], r["labels"]))
-        savings = [s for pair in sorted({(r["system"], r["method"]) for r in rows}) for s in saved(rows, *pair)]
-        provenance.write("sysid_samples", rows, savings=savings, settings={k: asdict(s) for k, s in BUDGETS.items()})
-        draw(rows, DOCS / "sysid_samples.png")
-    for saving in savings:
-        print(saving)
+            rows.append(errors(model, n, method, gradients))
+        keep_samples(rows)
+
+
+def drawn(systems: list[str]) -> None:
+    """Mean error of nocl's recipe where it draws the labels itself, with its own budgets: it picks where f is asked."""
+    rows = [r for r in kept_samples() if r["method"] != "drawn" or r["system"] not in systems]
+    for name, samples in product(systems, DRAWN):
+        model = identify(load_ocp(name).system, settings=Settings(samples=samples), progress=False)
+        rows.append(errors(model, model.card["labels"], "drawn", True))
+        keep_samples(rows)
+
+
+def kept_samples() -> list[dict[str, Any]]:
+    path = provenance.RESULTS / "sysid_samples.json"
+    return store.read_json(path)["rows"] if path.exists() else []
+
+
+def errors(model: LearnedDynamics, labels: int, method: str, gradients: bool) -> dict[str, Any]:
+    score = model.score(5000)
+    row = {"system": model.system.name, "labels": labels, "method": method, "gradients": gradients, "mean": score.mean,
+           "median": score.median, "jacobian": score.jacobian, "seconds": model.card["seconds"]}
+    print(row, flush=True)
+    return row
+
+
+def keep_samples(rows: list[dict[str, Any]]) -> None:
+    """All rows so far, what Jacobians save, and the figure."""
+    rows.sort(key=lambda r: (r["system"], r["labels"]))
+    savings = [s for pair in sorted({(r["system"], r["method"]) for r in rows}) for s in saved(rows, *pair)]
+    provenance.write("sysid_samples", rows, savings=savings, settings={k: asdict(s) for k, s in BUDGETS.items()})
+    draw(rows, DOCS / "sysid_samples.png")
 
 
 def saved(rows: list[dict[str, Any]], system: str, method: str) -> list[dict[str, Any]]:
     """For each number of labels with Jacobians, how many without reach the same error, in multiples of it.
 
     Log-interpolated between measured numbers of labels; `at_least` where the most that were tried do not reach it.
+    Labels that nocl draws are compared with its recipe's on given rows.
     """
     with_, without = ([(r["labels"], r["mean"]) for r in rows if (r["system"], r["method"], r["gradients"]) ==
-                       (system, method, gradients)] for gradients in (True, False))
+                       (system, name, gradients)] for name, gradients in
+                      ((method, True), ("default" if method == "drawn" else method, False)))
     return [{"system": system, "method": method, "labels": n, "mean": error, "at_least": needed is None,
              "times": round((needed or without[-1][0]) / n, 2)}
-            for n, error in with_ for needed in [_needed(without, error)]]
+            for n, error in with_ if without for needed in [_needed(without, error)]]
 
 
 def _needed(curve: list[tuple[int, float]], error: float) -> float | None:
@@ -173,6 +197,9 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
                     axes.plot([r["labels"] for r in own], [r["mean"] for r in own], "o-" if gradients else "s--",
                               color=colour, ms=4, mfc=colour if gradients else "none",
                               label=f"{title}, {'with' if gradients else 'without'} Jacobians")
+            own = [r for r in rows if (r["system"], r["method"]) == (system, "drawn")]
+            axes.plot([r["labels"] for r in own], [r["mean"] for r in own], "*", color=COLOURS[0], ms=9,
+                      label="structure first, labels drawn by nocl")
             axes.set(xscale="log", yscale="log", title=system, xlabel="labelled samples",
                      ylabel="mean of ||f_theta - f||")
         panels[0].legend(fontsize=7)
@@ -193,12 +220,16 @@ def main() -> None:
     one = commands.add_parser("samples")
     one.add_argument("--systems", nargs="+", default=["cartpole", "acrobot"])
     one.add_argument("--labels", nargs="+", type=int, default=LABELS)
+    one = commands.add_parser("drawn")
+    one.add_argument("--systems", nargs="+", default=list(sysid.SYSTEMS))
     commands.add_parser("table").add_argument("run", type=Path)
     args = parser.parse_args()
     if args.command == "speed":
         speed(args.rounds, args.steps)
     elif args.command == "samples":
         samples(args.systems, args.labels)
+    elif args.command == "drawn":
+        drawn(args.systems)
     else:
         table(args.run)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
@@ -15,12 +16,16 @@ from nocl.nets import MLP, FeatureNet
 from nocl.structure import Box, Group, Structure
 from nocl.sysid_labels import Pool, Source, draw_pool, labelled
 from nocl.sysid_progress import Checkpoint, Progress
-from nocl.sysid_settings import Settings
+from nocl.sysid_settings import Budget, Settings
 
 MAX_POLISHED = 2600  # parameters: beyond, a Levenberg-Marquardt step costs more than it gives
 PROBES = 256  # rows at which the frequencies of the first layer are measured
 SHARE, LEAST = 0.7, 0.5  # of the measured frequencies, as first weights; and the least of these
-FULL_JACOBIAN = 4  # variables up to which every derivative is supervised, beyond it random directions
+FULL_JACOBIAN = 6  # variables up to which every derivative is supervised, beyond it random directions
+PLAIN = 4  # variables beyond which a network without sines and cosines of angles is a plain one
+NARROWEST = 8  # wide, however few the labels
+SMOOTH = 0.5  # times the hidden layers' usual first weights, where labels are few
+LONGER = 3  # times as many Levenberg-Marquardt steps there: each is cheap, and they go on to gain
 
 
 def fit_groups(source: Source, parts: Structure, settings: Settings, seed: int, bar: Progress,
@@ -43,38 +48,60 @@ def fit_groups(source: Source, parts: Structure, settings: Settings, seed: int, 
 
 
 def fit_group(box: Box, parts: Structure, pool: Pool, index: int, settings: Settings, seed: int,
-               bar: Progress, old: fit.Weights | None = None, frequency: list[Tensor] | None = None) -> fit.Weights:
+              bar: Progress, old: fit.Weights | None = None, frequency: list[Tensor] | None = None) -> fit.Weights:
     """Train one network, from `old` weights without SOAP's large steps; its weights in the units of its labels."""
     group = parts.groups[index]
     samples, mean, spread = _samples(box, group, pool, index, settings.angles)
-    generator = torch.Generator().manual_seed(seed * 1000 + index)
-    draws = Draws(samples, settings.gradient_weight, generator)
-    title, v = f"network {index + 1}/{len(parts.groups)}", len(group.variables)
-    plain = draws.variables > FULL_JACOBIAN and not (settings.angles and set(group.variables) & set(box.angles))
-    budget = settings.budget(v, plain)
+    draws = Draws(samples, settings.gradient_weight, torch.Generator().manual_seed(seed * 1000 + index))
+    plain = draws.variables > PLAIN and not (settings.angles and set(group.variables) & set(box.angles))
+    budget = settings.budget(len(group.variables), plain)
+    widest = _widest(samples.phi.shape[1], draws.labels)
+    few = widest < budget.width
+    if few:
+        budget = replace(budget, width=widest, polish=LONGER * budget.polish)
+    own = None if old is None else [old[0], old[1], _scaled(old, -mean / spread, 1 / spread)]
+    first, title = None if frequency is None else frequency[index], f"network {index + 1}/{len(parts.groups)}"
+    lr = settings.lr if old is None else settings.lr / 4
     if plain:
-        own = None if old is None else [old[0], old[1], _scaled(old, -mean / spread, 1 / spread)]
         with bar.stage(f"{title}, SOAP", budget.iterations) as report:
-            weights = sysid_plain.train(samples, budget, settings.lr if old is None else settings.lr / 4,
-                                        settings.gradient_weight, generator, report,
-                                        None if frequency is None else frequency[index], own)
-        return [*weights[:2], _scaled(weights, mean, spread)]
-    if old is None:
-        weights = fit.initial(samples.phi.shape[1], budget.width, samples, generator,
-                              None if frequency is None else frequency[index])
+            weights = sysid_plain.train(samples, budget, lr, settings.gradient_weight, draws.generator, report, first,
+                                        own)
+    elif own is None:
+        start = fit.initial(samples.phi.shape[1], budget.width, samples, draws.generator, first)
+        start = [SMOOTH * start[0], SMOOTH * start[1], start[2]] if few else start
+        weights = _trained(start, draws, budget, lr, title, bar)
     else:
-        weights = [old[0], old[1], _scaled(old, -mean / spread, 1 / spread)]
-    polish = budget.polish if sum(w.numel() for w in weights) <= MAX_POLISHED else 0
-    iterations = 0 if old is not None and polish else budget.iterations
-    if iterations:
-        with bar.stage(f"{title}, SOAP", iterations) as report:
-            weights = fit.soap([w.float() for w in weights], draws.to(torch.float32), iterations=iterations,
-                               batch=budget.batch, lr=settings.lr if old is None else settings.lr / 4, report=report)
-    if polish:
-        with bar.stage(f"{title}, Levenberg-Marquardt", polish) as report:
-            weights = fit.levenberg_marquardt(weights, draws, steps=polish, batch=budget.polish_batch, report=report)
-    weights = [w.double() for w in weights]
+        polished = budget.polish and _can_be_polished(own)
+        weights = _trained(own, draws, replace(budget, iterations=0) if polished else budget, lr, title, bar)
     return [*weights[:2], _scaled(weights, mean, spread)]
+
+
+def _trained(weights: fit.Weights, draws: Draws, budget: Budget, lr: float, title: str, bar: Progress) -> fit.Weights:
+    """After SOAP and Levenberg-Marquardt; float64."""
+    if budget.iterations:
+        with bar.stage(f"{title}, SOAP", budget.iterations) as report:
+            weights = fit.soap([w.float() for w in weights], draws.to(torch.float32), iterations=budget.iterations,
+                               batch=budget.batch, lr=lr, report=report)
+    if budget.polish and _can_be_polished(weights):
+        with bar.stage(f"{title}, Levenberg-Marquardt", budget.polish) as report:
+            weights = fit.levenberg_marquardt(weights, draws, steps=budget.polish, batch=budget.polish_batch,
+                                              report=report)
+    return [w.double() for w in weights]
+
+
+def _can_be_polished(weights: fit.Weights) -> bool:
+    return sum(w.numel() for w in weights) <= MAX_POLISHED
+
+
+def _widest(features: int, labels: tuple[int, int]) -> int:
+    """The width h of the hidden layers at which half as many weights as labels (rows, outputs) fit, or NARROWEST.
+
+    h^2 + h (F + 2) + m (h + 1 + F) weights of F features and m outputs: networks with more of them swing between the
+    samples, with Jacobians, too.
+    """
+    rows, m = labels
+    b = features + 2 + m
+    return max(NARROWEST, int(np.sqrt(b**2 / 4 + max(rows * m / 2 - m * (1 + features), 0.0)) - b / 2))
 
 
 def frequencies(source: Source, parts: Structure, z: Array) -> list[Tensor]:
@@ -145,7 +172,8 @@ def _samples(box: Box, group: Group, pool: Pool, index: int, angles: bool) -> tu
 
 
 class Draws:
-    """Random batches of samples, with the scale of each residual: value 1, derivatives in units of their spread."""
+    """Random batches of samples, all of them where there are no more than a batch holds, and the scale of each
+    residual: value 1, derivatives in units of their spread."""
 
     def __init__(self, samples: fit.Samples, weight: float, generator: torch.Generator) -> None:
         self.samples, self.generator = samples, generator
@@ -161,8 +189,15 @@ class Draws:
             each = (weight / rms.square().sum(dim=1).sqrt().clamp(min=0.05)).expand(2, 1, m)
         self.scale = torch.cat([self.scale, each])
 
+    @property
+    def labels(self) -> tuple[int, int]:
+        """(values and derivatives of each output, outputs)."""
+        n, m = self.samples.y.shape
+        return n * (1 + self.variables), m
+
     def __call__(self, n: int) -> tuple[fit.Batch, Tensor]:
-        rows = torch.randint(len(self.samples), (n,), generator=self.generator)
+        N = len(self.samples)
+        rows = torch.arange(N) if n >= N else torch.randint(N, (n,), generator=self.generator)
         return self.samples.batch(rows, self._directions()), self.scale
 
     def _directions(self) -> Tensor:

@@ -43,6 +43,7 @@ class Budget:
 class Settings:
     """Of methods "default" and "mlp". None: by the number of a network's variables, as in Budget.of."""
 
+    # where labels are fewer than two for each weight, networks are narrower than this, and polished for longer
     width: int | None = None
     iterations: int | None = None
     batch: int | None = None
