@@ -36,6 +36,8 @@ DRAWN = (10, 200_000, 1_000_000)  # labels for the networks, at least 2,048 rows
 # the same at every number of labels, with and without gradients
 BUDGETS = {"default": Settings(width=32, iterations=3000, batch=512, polish=100, polish_batch=512),
            "mlp": Settings(width=64, iterations=4000, batch=512, polish=0)}
+WAYS = {"default": ("default", True), "default-values": ("default", False), "mlp": ("mlp", True),
+        "mlp-values": ("mlp", False)}  # method, with Jacobians
 
 Step = Callable[[], None]
 
@@ -112,13 +114,14 @@ def _loop(mlp: MLP, z: Tensor) -> tuple[Tensor, Tensor]:
     return y, torch.stack(rows, 1)
 
 
-def samples(systems: list[str], labels: list[int]) -> None:
+def samples(systems: list[str], labels: list[int], ways: list[str]) -> None:
     """Mean error of nocl's recipe and of the plain network, with and without Jacobian labels, on the same rows."""
-    rows = [r for r in kept_samples() if (r["system"], r["labels"]) not in product(systems, labels)]
+    anew = list(product(systems, labels, (WAYS[way] for way in ways)))
+    rows = [r for r in kept_samples() if (r["system"], r["labels"], (r["method"], r["gradients"])) not in anew]
     for name, n in product(systems, labels):
         system = load_ocp(name).system
         data = Dataset.sample(system, n, 7)
-        for method, gradients in product(BUDGETS, (True, False)):
+        for method, gradients in (WAYS[way] for way in ways):
             model = identify(system, data=data, method=method, gradients=gradients, settings=BUDGETS[method],
                              progress=False)
             rows.append(errors(model, n, method, gradients))
@@ -220,6 +223,7 @@ def main() -> None:
     one = commands.add_parser("samples")
     one.add_argument("--systems", nargs="+", default=["cartpole", "acrobot"])
     one.add_argument("--labels", nargs="+", type=int, default=LABELS)
+    one.add_argument("--ways", nargs="+", choices=WAYS, default=list(WAYS))
     one = commands.add_parser("drawn")
     one.add_argument("--systems", nargs="+", default=list(sysid.SYSTEMS))
     commands.add_parser("table").add_argument("run", type=Path)
@@ -227,7 +231,7 @@ def main() -> None:
     if args.command == "speed":
         speed(args.rounds, args.steps)
     elif args.command == "samples":
-        samples(args.systems, args.labels)
+        samples(args.systems, args.labels, args.ways)
     elif args.command == "drawn":
         drawn(args.systems)
     else:

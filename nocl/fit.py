@@ -26,6 +26,27 @@ class Batch:
 
     phi: Tensor  # [1+k, B, F]
     y: Tensor  # [1+k, B, m]
+    mix: Tensor | None = None  # [1+k, B, m, C]
+
+
+@dataclass(frozen=True, eq=False)
+class Mix:
+    """Labels that are sums of the network's C outputs with known weights: m functions sum_c place[m, c] w(z) y_c(z)."""
+
+    weights: Tensor  # [N, J], of which each output has one
+    place: Tensor  # [m, C, J], 1 where output c with weight j belongs to label m
+    rate: Tensor  # [J, v], d weights_j / d variable: constant
+
+    def to(self, dtype: torch.dtype) -> Mix:
+        return Mix(self.weights.to(dtype), self.place.to(dtype), self.rate.to(dtype))
+
+    def batch(self, rows: Tensor, q: Tensor) -> Tensor:
+        """[1+k, B, m, C] along directions q [k, v]."""
+        first = torch.einsum("bj,mcj->bmc", self.weights[rows], self.place)
+        if not len(q):
+            return first[None]
+        tangents = torch.einsum("kv,jv,mcj->kmc", q, self.rate, self.place)
+        return torch.cat([first[None], tangents[:, None].expand(-1, *first.shape)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,23 +58,32 @@ class Samples:
     owner: Tensor  # [F]
     y: Tensor  # [N, m]
     dy: Tensor | None  # [N, m, v]
+    mix: Mix | None = None  # None: the labels are the network's outputs
 
     def __len__(self) -> int:
         return len(self.y)
 
+    @property
+    def outputs(self) -> int:
+        """Of the network."""
+        return self.y.shape[1] if self.mix is None else self.mix.place.shape[1]
+
     def to(self, dtype: torch.dtype) -> Samples:
-        dy = None if self.dy is None else self.dy.to(dtype)
-        return Samples(self.phi.to(dtype), self.slope.to(dtype), self.owner, self.y.to(dtype), dy)
+        dy, mix = None if self.dy is None else self.dy.to(dtype), None if self.mix is None else self.mix.to(dtype)
+        return Samples(self.phi.to(dtype), self.slope.to(dtype), self.owner, self.y.to(dtype), dy, mix)
 
     def batch(self, rows: Tensor, directions: Tensor) -> Batch:
         """The samples at these rows, with tangents along directions [k, v]."""
         phi, y = self.phi[rows], self.y[rows]
-        if self.dy is None or not len(directions):
-            return Batch(phi[None], y[None])
+        if self.dy is None:
+            directions = directions[:0]
         q = directions.to(phi.dtype)
+        mix = None if self.mix is None else self.mix.batch(rows, q)
+        if self.dy is None or not len(q):
+            return Batch(phi[None], y[None], mix)
         tangents = self.slope[rows] * q[:, None, self.owner]  # [k, B, F]
         derivatives = torch.einsum("bmv,kv->kbm", self.dy[rows], q)
-        return Batch(torch.cat([phi[None], tangents]), torch.cat([y[None], derivatives]))
+        return Batch(torch.cat([phi[None], tangents]), torch.cat([y[None], derivatives]), mix)
 
 
 def initial(n_features: int, width: int, samples: Samples, generator: torch.Generator,
@@ -66,9 +96,14 @@ def initial(n_features: int, width: int, samples: Samples, generator: torch.Gene
     W1, W2 = hidden(n_features, h, generator, frequency)
     some = slice(0, 20_000)
     phi = torch.cat([samples.phi[some], torch.ones(len(samples.phi[some]), 1, dtype=samples.phi.dtype)], 1).double()
-    c = torch.linalg.lstsq(phi, samples.y[some].double(), driver="gelsd").solution.float()
-    W3 = torch.cat([torch.zeros(c.shape[1], h), c[-1:].T, c[:-1].T], 1)
-    return [W1, W2, W3]
+    y = samples.y[some].double()
+    if samples.mix is None:
+        c = torch.linalg.lstsq(phi, y, driver="gelsd").solution.T.float()
+    else:
+        mix = torch.einsum("bj,mcj->bmc", samples.mix.weights[some], samples.mix.place).double()
+        basis = torch.einsum("bmc,bf->bmcf", mix, phi).flatten(2).flatten(0, 1)
+        c = torch.linalg.lstsq(basis, y.reshape(-1, 1), driver="gelsd").solution.view(samples.outputs, -1).float()
+    return [W1, W2, torch.cat([torch.zeros(len(c), h), c[:, -1:], c[:, :-1]], 1)]
 
 
 def hidden(n_features: int, width: int, generator: torch.Generator,
@@ -94,9 +129,17 @@ def _sine(z: Tensor, bias: Tensor) -> Tensor:
     return torch.cat([torch.sin(first), torch.cos(first) * z[1:]])
 
 
+def mixed(y: Tensor, mix: Tensor | None) -> Tensor:
+    """Value and tangents [1+k, B, m] of the labelled functions from those of the outputs [1+k, B, C]."""
+    if mix is None:
+        return y
+    own = torch.einsum("bmc,kbc->kbm", mix[0], y)
+    return torch.cat([own[:1], own[1:] + torch.einsum("kbmc,bc->kbm", mix[1:], y[0])])
+
+
 def loss(weights: Sequence[Tensor], batch: Batch, scale: Tensor) -> Tensor:
     """Sum over value and tangents and outputs of the mean square of (residual * scale [1+k, 1, m])."""
-    return ((forward(weights, batch.phi) - batch.y) * scale).square().mean(dim=1).sum()
+    return ((mixed(forward(weights, batch.phi), batch.mix) - batch.y) * scale).square().mean(dim=1).sum()
 
 
 Draw = Callable[[int], tuple[Batch, Tensor]]  # batch size -> a fresh batch and the scale of its residuals
@@ -170,30 +213,47 @@ def _step(weights: Weights, JJ: Tensor, Jr: Tensor, damping: float) -> Weights |
 
 def gauss_newton(weights: Sequence[Tensor], batch: Batch, scale: Tensor,
                  chunk: int = 512) -> tuple[Tensor, Tensor, float]:
-    """(J'J [P, P], J'r [P], r'r) over the batch, divided by B: J in float32, the residual r and the sums in float64.
-
-    An output's residuals see only their own row of W3, so the products are taken output by output.
-    """
-    r = (forward([w.double() for w in weights], batch.phi.double()) - batch.y) * scale  # [1+k, B, m]
-    single, P, (_, B, m) = [w.float() for w in weights], sum(w.numel() for w in weights), r.shape
-    hidden, own = sum(w.numel() for w in weights[:2]), weights[2].shape[1]
+    """(J'J [P, P], J'r [P], r'r) over the batch, divided by B: J in float32, the residual r and the sums in float64."""
+    mix = None if batch.mix is None else batch.mix.double()
+    r = (mixed(forward([w.double() for w in weights], batch.phi.double()), mix) - batch.y) * scale  # [1+k, B, m]
+    single, P, B = [w.float() for w in weights], sum(w.numel() for w in weights), r.shape[1]
     JJ, Jr = torch.zeros(P, P, dtype=torch.float64), torch.zeros(P, dtype=torch.float64)
     for start in range(0, B, chunk):
         rows = slice(start, start + chunk)
-        J = parameter_jacobian(single, batch.phi[:, rows].float())  # [m, 1+k, B, hidden + own]
+        J = parameter_jacobian(single, batch.phi[:, rows].float())  # [C, 1+k, B, hidden + own]
+        if batch.mix is not None:
+            _add_mixed(JJ, Jr, J, batch.mix[:, rows].float(), r[:, rows], scale.float(), single[2].shape[1])
+            continue
         J *= scale.float().permute(2, 0, 1)[..., None]
-        for o in range(m):
-            Jo = J[o].view(-1, hidden + own)
-            last = slice(hidden + o * own, hidden + (o + 1) * own)
-            square = _upper(Jo)
-            JJ[:hidden, :hidden] += square[:hidden, :hidden]
-            JJ[:hidden, last] += square[:hidden, hidden:]
-            JJ[last, last] += square[hidden:, hidden:]
-            product = (Jo.T @ r[:, rows, o].reshape(-1).float()).double()
-            Jr[:hidden] += product[:hidden]
-            Jr[last] += product[hidden:]
+        _add(JJ, Jr, J, r[:, rows], single[2].shape[1])
     JJ = JJ.triu() + JJ.triu(1).T
     return JJ / B, Jr / B, float(r.square().sum() / B)
+
+
+def _add(JJ: Tensor, Jr: Tensor, J: Tensor, r: Tensor, own: int) -> None:
+    """An output's residuals see only their own row of W3, so the products are taken output by output."""
+    hidden = J.shape[3] - own
+    for o, Jo in enumerate(J.flatten(1, 2)):
+        last = slice(hidden + o * own, hidden + (o + 1) * own)
+        square = _upper(Jo)
+        JJ[:hidden, :hidden] += square[:hidden, :hidden]
+        JJ[:hidden, last] += square[:hidden, hidden:]
+        JJ[last, last] += square[hidden:, hidden:]
+        product = (Jo.T @ r[:, :, o].reshape(-1).float()).double()
+        Jr[:hidden] += product[:hidden]
+        Jr[last] += product[hidden:]
+
+
+def _add_mixed(JJ: Tensor, Jr: Tensor, J: Tensor, mix: Tensor, r: Tensor, scale: Tensor, own: int) -> None:
+    """Labels see all outputs, with the weights of mix [1+k, B, m, C]."""
+    hidden, C = J.shape[3] - own, J.shape[0]
+    for m in range(mix.shape[2]):
+        each = mix[0, :, m].T[:, None, :, None] * J  # [C, 1+k, B, .]
+        each[:, 1:] += mix[1:, :, m].permute(2, 0, 1)[..., None] * J[:, :1]
+        row = torch.cat([each[..., :hidden].sum(dim=0), *(each[c, :, :, hidden:] for c in range(C))], 2)
+        row = (row * scale[:, :, m, None]).flatten(0, 1)
+        JJ += _upper(row)
+        Jr += (row.T @ r[:, :, m].reshape(-1).float()).double()
 
 
 def _upper(J: Tensor) -> Tensor:

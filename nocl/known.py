@@ -11,6 +11,7 @@ import numpy as np
 
 from nocl import checks
 from nocl import structure as structures
+from nocl.affine import split_at
 from nocl.data import Dataset
 from nocl.structure import Box, Expansion, Group, Oracle, Split, Structure
 from nocl.system import System
@@ -51,15 +52,12 @@ class Stated:
         """The structure that is stated and nothing else: one network of all variables that are left, for all rows."""
         split = Split(box, (), np.zeros(0), np.zeros(0))
         if self.control_affine:
-            w = list(range(box.nx, box.nz))
-            w0 = np.clip(0.0, box.lb[w], box.ub[w])
-            up, down = box.ub[w] - w0, box.lb[w] - w0
-            split = Split(box, tuple(w), w0, np.where(up >= -down, up, down))
+            split = split_at(box, range(box.nx, box.nz))
         open_entries = tuple(e for e in range(split.n_entries) if e // split.columns not in self.rows)
         expansions = (Expansion(box, open_entries),) if open_entries else ()
         groups = (Group(split.rest, tuple(range(len(open_entries)))),) if open_entries else ()
-        none = structures._with_jacobian(self.z, [ca.SX(0)] * len(open_entries))
-        structure = Structure(split, structures._with_jacobian(self.z, [ca.SX(0)] * split.n_entries), expansions, none,
+        none = structures.with_jacobian(self.z, [ca.SX(0)] * len(open_entries))
+        structure = Structure(split, structures.with_jacobian(self.z, [ca.SX(0)] * split.n_entries), expansions, none,
                               groups, "", 0)
         said = "; ".join(filter(None, [self.words(box), words])) or "no structure used: one network of all variables"
         return replace(self.add(structure), words=said)
@@ -73,7 +71,7 @@ class Stated:
             entries[i * structure.split.columns] = value
             for j in range(1, structure.split.columns):
                 entries[i * structure.split.columns + j] = ca.SX(0)
-        return replace(structure, linear=structures._with_jacobian(self.z, entries))
+        return replace(structure, linear=structures.with_jacobian(self.z, entries))
 
     def residual(self, oracle: Oracle, nx: int) -> Oracle:
         """The oracle with 0 for the stated rows, values and Jacobians: nothing is left to find there."""

@@ -153,7 +153,7 @@ class Expansion:
         value = value[:, own].reshape(T, len(z), len(own))
         gradient = gradient[:, own].reshape(T, len(z), len(own), -1)
         symbol = ca.SX.sym("z", self.box.nz)
-        basis = evaluate(_with_jacobian(symbol, self.monomials(symbol)), rows[:, 0])[0]  # [T nodes, T terms]
+        basis = evaluate(with_jacobian(symbol, self.monomials(symbol)), rows[:, 0])[0]  # [T nodes, T terms]
         interpolate = np.linalg.inv(basis)  # [T terms, T nodes]
         value = np.einsum("ts,sne->net", interpolate, value)
         gradient = np.einsum("ts,snek->netk", interpolate, gradient)
@@ -207,6 +207,11 @@ class Structure:
     def cost(self) -> int:
         """Labels of f that one row of coefficient labels takes."""
         return self.split.columns * sum(expansion.terms for expansion in self.expansions)
+
+    def rows(self, group: Group) -> tuple[int, ...]:
+        """The rows of xdot that the group's coefficients are in; of expansions without variables."""
+        own = [e for expansion in self.expansions for e in expansion.entries]
+        return tuple(sorted({own[c] // self.split.columns for c in group.coefficients}))
 
     def residual(self, oracle: Oracle, z: Array) -> tuple[Array, Array]:
         """The networks' labels: coefficients [N, C] and gradients [N, C, nz] at rows z, less their exact parts."""
@@ -262,7 +267,7 @@ def evaluate(function: ca.Function, z: Array) -> tuple[Array, Array]:
     return value.T.reshape(len(z), rows), slope.reshape(rows, len(z), z.shape[1]).transpose(1, 0, 2)
 
 
-def _with_jacobian(z: ca.SX, expressions: Sequence[ca.SX]) -> ca.Function:
+def with_jacobian(z: ca.SX, expressions: Sequence[ca.SX]) -> ca.Function:
     column = ca.densify(ca.vertcat(*expressions)) if expressions else ca.SX(0, 1)
     return ca.Function("known", [z], [column, ca.densify(ca.jacobian(column, z))], ["z"], ["value", "jacobian"])
 
@@ -271,8 +276,8 @@ def plain(box: Box, words: str = "no structure used: one network of all variable
     """One network z -> f, nothing known."""
     z, zero = ca.SX.sym("z", box.nz), [ca.SX(0)] * box.nx
     group = Group(tuple(range(box.nz)), tuple(range(box.nx)))
-    return Structure(Split(box, (), np.zeros(0), np.zeros(0)), _with_jacobian(z, zero),
-                     (Expansion(box, tuple(range(box.nx))),), _with_jacobian(z, zero), (group,), words, 0)
+    return Structure(Split(box, (), np.zeros(0), np.zeros(0)), with_jacobian(z, zero),
+                     (Expansion(box, tuple(range(box.nx))),), with_jacobian(z, zero), (group,), words, 0)
 
 
 def find(oracle: Oracle, box: Box, *, seed: int = 0, probes: int = 64, features: bool = True) -> Structure:
@@ -286,7 +291,7 @@ def find(oracle: Oracle, box: Box, *, seed: int = 0, probes: int = 64, features:
     split = affine_split(counter, box, rng, probes)
     first = _Stage(box, partial(split.labels, counter), split.scale, split.rest, rng, probes)
     known, left = first.exact(features)
-    linear = _with_jacobian(first.z, known)
+    linear = with_jacobian(first.z, known)
     entries, scale = _less(first.labels, linear), first.size()
     if features:
         expansions = _expansions(box, entries, scale, left, rng, probes)
@@ -301,7 +306,7 @@ def find(oracle: Oracle, box: Box, *, seed: int = 0, probes: int = 64, features:
         found, variables = stage.exact(features)
         learned |= {len(exact) + c: v for c, v in variables.items()}
         exact += found
-    structure = Structure(split, linear, expansions, _with_jacobian(first.z, exact), _grouped(learned), "", counter.n)
+    structure = Structure(split, linear, expansions, with_jacobian(first.z, exact), _grouped(learned), "", counter.n)
     return replace(structure, words=describe(structure))
 
 
@@ -312,7 +317,7 @@ def _constant(size: Array) -> Callable[[Array], Array]:
 def read(z: Array, value: Array, gradient: Array, box: Box, *, features: bool = True) -> Structure:
     """The structure that given labels show: rows z [N, nz], f [N, nx], df/dz [N, nx, nz]; constant slopes, polynomials.
 
-    What is affine in the controls cannot be told from scattered samples, and is not looked for.
+    What is affine in the controls cannot be told from scattered samples; see nocl.sysid_affine.
     """
     split = Split(box, (), np.zeros(0), np.zeros(0))
     tolerance = TOLERANCE * split.scale(value)[:, None]
@@ -330,8 +335,8 @@ def read(z: Array, value: Array, gradient: Array, box: Box, *, features: bool = 
     known, left = _known(box, slopes, draw, split.scale, symbol, range(box.nz), features and len(z) >= 40)
     expansions = (Expansion(box, tuple(left)),) if left else ()
     learned = {c: left[e] for c, e in enumerate(left)}
-    structure = Structure(split, _with_jacobian(symbol, known), expansions,
-                          _with_jacobian(symbol, [ca.SX(0)] * len(left)), _grouped(learned), "", len(z))
+    structure = Structure(split, with_jacobian(symbol, known), expansions,
+                          with_jacobian(symbol, [ca.SX(0)] * len(left)), _grouped(learned), "", len(z))
     return replace(structure, words=describe(structure))
 
 
@@ -410,7 +415,7 @@ def _degrees(box: Box, entries: Labels, scale: Array, k: int, rng: np.random.Gen
     symbol = ca.SX.sym("z", box.nz)
     degrees = np.zeros(len(scale), dtype=int)
     for degree in (1,) if k in box.angles else (3, 2, 1):
-        basis = evaluate(_with_jacobian(symbol, _powers(box, k, degree, symbol)), rows[:, 0])[0]
+        basis = evaluate(with_jacobian(symbol, _powers(box, k, degree, symbol)), rows[:, 0])[0]
         error = basis @ np.linalg.lstsq(basis, labels, rcond=None)[0] - labels
         fits = np.abs(error).reshape(-1, len(scale)).max(axis=0) <= TOLERANCE * scale
         degrees[fits] = degree
@@ -505,7 +510,7 @@ def _polynomials(box: Box, draw: Draw, scale: Callable[[Array], Array], group: G
         (fit, fit_value), (test, test_value) = draw(2 * len(terms) + 20), draw(2 * len(terms) + 20)
         if len(fit) < len(terms) + 20:  # data ran out
             break
-        linear, basis = _with_jacobian(z, [known[e] for e in left]), _with_jacobian(z, terms)
+        linear, basis = with_jacobian(z, [known[e] for e in left]), with_jacobian(z, terms)
         fit_target = fit_value[:, left] - evaluate(linear, fit)[0]
         test_target = test_value[:, left] - evaluate(linear, test)[0]
         fit_basis, test_basis = evaluate(basis, fit)[0], evaluate(basis, test)[0]

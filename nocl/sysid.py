@@ -29,6 +29,7 @@ from nocl.logs import Log
 from nocl.nets import MLP, FeatureNet
 from nocl.sampling import Seed
 from nocl.structure import Box, Expansion, Group, Split, Structure
+from nocl.sysid_affine import better_affine
 from nocl.sysid_labels import Source, box_of, data_box, find_structure, labelled, rows_of
 from nocl.sysid_logs import first_states, fit_log
 from nocl.sysid_networks import assemble, fit_group, fit_groups, weights_of
@@ -169,7 +170,8 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
     known : dict from states to their derivatives (SX, numbers, names of states or controls), or names of states
         Equations that need not be learned; a bare name stands for the system's own equation.
     control_affine : bool
-        xdot = a(x) + B(x) u. Labels of f with Jacobians show that by themselves.
+        xdot = a(x) + B(x) u. Labels of f with Jacobians show that by themselves: drawn ones by moving the controls
+        alone, given ones by a trial (nocl.sysid_affine).
     method : "default", "mlp" or "paper"
         Structure first; one plain sine network; the paper's network, loss and optimiser.
     settings : Settings, (method "paper") PaperSettings or (logs) LogSettings
@@ -197,7 +199,10 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
         if method == "mlp":
             settings = replace(settings, structure=False, angles=False)
         parts = find_structure(source, settings, seed, stated)
-        weights = fit_groups(source, parts, settings, seed, bar, Checkpoint.at(checkpoint, system, seed, settings))
+        if settings.structure and not stated.control_affine:
+            parts = better_affine(source, parts, settings, seed, bar)
+        kept = Checkpoint.at(checkpoint, system, seed, settings, parts.words, source.digest)
+        weights = fit_groups(source, parts, settings, seed, bar, kept)
         net, words = assemble(parts, weights, settings.angles), parts.words
     card = {"method": method, "gradients": source.gradients, "seed": seed, "settings": asdict(settings),
             "labels": source.labels, "seconds": round(time.perf_counter() - start, 3), "torch": torch.__version__}
@@ -230,9 +235,6 @@ def _check_stated(stated: Stated, method: str, source: Source) -> None:
     if stated and method == "paper":
         raise ValueError("identify: method 'paper' learns everything; expected no `known` and no `control_affine`: use "
                          "the default method")
-    if stated.control_affine and source.data is not None:
-        raise ValueError("identify: control_affine is for labels that nocl draws, and for logs; got a Dataset: pass "
-                         "nocl.Log.of(system, t, x, u, xdot=...) of the trajectories instead")
 
 
 def _check_arguments(system: System, method: str, settings: Settings | PaperSettings | LogSettings | None, seed: int,
@@ -275,7 +277,7 @@ def _refined(model: LearnedDynamics, states: ArrayLike, controls: ArrayLike, spr
     old = [weights_of(net) for net in model.net.nets if isinstance(net, MLP)]
     angles = bool(model.card["settings"]["angles"])
     settings = replace(settings, angles=angles)
-    weights = [fit_group(box, parts, pool, i, settings, seed, bar, w) for i, w in enumerate(old)]
+    weights = [fit_group(parts, pool, i, settings, seed, bar, w) for i, w in enumerate(old)]
     net = assemble(parts, weights, angles)
     card = {**model.card, "labels": model.card["labels"] + source.labels, "refined": model.card.get("refined", 0) + 1,
             "seconds": round(model.card["seconds"] + time.perf_counter() - start, 3),

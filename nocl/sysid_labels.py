@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
+import casadi as ca
 import numpy as np
 
 from nocl import structure as structures
+from nocl.affine import affine_in_controls
 from nocl.checks import Array
 from nocl.data import Dataset
 from nocl.known import Stated
@@ -33,6 +36,14 @@ class Source:
     oracle: Oracle | None  # counts what it is asked
     data: tuple[Array, Array, Array | None] | None  # z, f, df/dz
     labels: int = 0
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the given data; empty where labels are drawn."""
+        whole = hashlib.sha256()
+        for array in self.data or ():
+            whole.update(b"none" if array is None else np.ascontiguousarray(array).tobytes())
+        return whole.hexdigest() if self.data else ""
 
     @staticmethod
     def of(system: System, data: Dataset | None, gradients: bool) -> Source:
@@ -100,6 +111,7 @@ def find_structure(source: Source, settings: Settings, seed: int, stated: Stated
         value, gradient = value.copy(), gradient.copy()
         value[:, list(stated.rows)], gradient[:, list(stated.rows)] = 0.0, 0.0
         found = structures.read(z, value, gradient, source.box, features=settings.features)
+        found = affine_in_controls(found) or found if stated.control_affine else found
     if not stated.rows:
         return found
     whole = stated.add(found)
@@ -108,24 +120,37 @@ def find_structure(source: Source, settings: Settings, seed: int, stated: Stated
 
 @dataclass(frozen=True, eq=False)
 class Pool:
-    """What the networks learn from: rows z, and the learned entries' labels by group."""
+    """What the networks learn from: rows z, and by group labels of its coefficients, or (mixed) of its rows of xdot.
+
+    Gradients are by the group's variables, those of mixed labels by the affine controls after them.
+    """
 
     z: Array  # [N, nz]
     value: list[Array]  # per group [N, m]
     gradient: list[Array] | None  # per group [N, m, v]
+    mixed: bool = False
 
 
 def draw_pool(source: Source, parts: Structure, settings: Settings, rng: np.random.Generator) -> Pool:
     """Labels for every group: at fresh uniform samples of the box, or all of the data."""
     if source.data is not None:
-        z, value, gradient = source.data
-        own = [e for expansion in parts.expansions for e in expansion.entries]  # without variables: entries of f
-        jacobian = np.zeros((len(z), source.box.nx, source.box.nz)) if gradient is None else gradient
-        known, slope = structures.evaluate(parts.linear, z)
-        return _collect([(z, (value - known)[:, own], (jacobian - slope)[:, own])], parts, gradient is not None)
+        return _given(*source.data, parts)
     assert source.oracle is not None
     z = source.box.sample(rows_of(parts, settings), rng)
     return labelled(source, parts, z)
+
+
+def _given(z: Array, value: Array, gradient: Array | None, parts: Structure) -> Pool:
+    """Data less what is known: coefficients themselves where each has a row of xdot of its own."""
+    symbol = ca.SX.sym("z", parts.split.box.nz)
+    known, slope = structures.evaluate(structures.with_jacobian(symbol, [parts.xdot({}, symbol)]), z)
+    values, slopes = [], []
+    for group in parts.groups:
+        rows, variables = list(parts.rows(group)), [*group.variables, *parts.split.affine]
+        values.append((value - known)[:, rows])
+        if gradient is not None:
+            slopes.append((gradient[:, rows] - slope[:, rows])[:, :, variables])
+    return Pool(z, values, None if gradient is None else slopes, bool(parts.split.affine))
 
 
 def rows_of(parts: Structure, settings: Settings) -> int:

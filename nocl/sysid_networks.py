@@ -8,6 +8,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from nocl import fit, sysid_plain
@@ -41,21 +42,22 @@ def fit_groups(source: Source, parts: Structure, settings: Settings, seed: int, 
     for i in range(len(parts.groups)):
         done = checkpoint.get(i)
         if done is None:
-            done = fit_group(source.box, parts, pool, i, settings, seed, bar, None, found)
+            done = fit_group(parts, pool, i, settings, seed, bar, None, found)
             checkpoint.put(i, done)
         weights.append(done)
     return weights
 
 
-def fit_group(box: Box, parts: Structure, pool: Pool, index: int, settings: Settings, seed: int,
+def fit_group(parts: Structure, pool: Pool, index: int, settings: Settings, seed: int,
               bar: Progress, old: fit.Weights | None = None, frequency: list[Tensor] | None = None) -> fit.Weights:
     """Train one network, from `old` weights without SOAP's large steps; its weights in the units of its labels."""
     group = parts.groups[index]
-    samples, mean, spread = _samples(box, group, pool, index, settings.angles)
+    samples, mean, spread = _samples(parts, pool, index, settings.angles)
     draws = Draws(samples, settings.gradient_weight, torch.Generator().manual_seed(seed * 1000 + index))
-    plain = draws.variables > PLAIN and not (settings.angles and set(group.variables) & set(box.angles))
+    angles = settings.angles and set(group.variables) & set(parts.split.box.angles)
+    plain = draws.variables > PLAIN and not angles and samples.mix is None
     budget = settings.budget(len(group.variables), plain)
-    widest = _widest(samples.phi.shape[1], draws.labels)
+    widest = _widest(samples.phi.shape[1], samples.outputs, draws.labels)
     few = widest < budget.width
     if few:
         budget = replace(budget, width=widest, polish=LONGER * budget.polish)
@@ -93,15 +95,14 @@ def _can_be_polished(weights: fit.Weights) -> bool:
     return sum(w.numel() for w in weights) <= MAX_POLISHED
 
 
-def _widest(features: int, labels: tuple[int, int]) -> int:
-    """The width h of the hidden layers at which half as many weights as labels (rows, outputs) fit, or NARROWEST.
+def _widest(features: int, outputs: int, labels: int) -> int:
+    """The width h of the hidden layers at which half as many weights as labels fit, or NARROWEST.
 
     h^2 + h (F + 2) + m (h + 1 + F) weights of F features and m outputs: networks with more of them swing between the
     samples, with Jacobians, too.
     """
-    rows, m = labels
-    b = features + 2 + m
-    return max(NARROWEST, int(np.sqrt(b**2 / 4 + max(rows * m / 2 - m * (1 + features), 0.0)) - b / 2))
+    b = features + 2 + outputs
+    return max(NARROWEST, int(np.sqrt(b**2 / 4 + max(labels / 2 - outputs * (1 + features), 0.0)) - b / 2))
 
 
 def frequencies(source: Source, parts: Structure, z: Array) -> list[Tensor]:
@@ -154,11 +155,12 @@ def _spread(box: Box) -> Array:
     return box.width / np.sqrt(12)
 
 
-def _samples(box: Box, group: Group, pool: Pool, index: int, angles: bool) -> tuple[fit.Samples, Array, Array]:
-    """(normalised samples of a group, the mean and spread that its labels were normalised by)."""
-    z = ca.SX.sym("z", box.nz)
+def _samples(parts: Structure, pool: Pool, index: int, angles: bool) -> tuple[fit.Samples, Array, Array]:
+    """(normalised samples of a group, the mean and spread that its network's outputs were normalised by)."""
+    box, group, z = parts.split.box, parts.groups[index], ca.SX.sym("z", parts.split.box.nz)
     phi, owner = _features(box, group, z, angles)
-    unit = _spread(box)[list(group.variables)]
+    variables = [*group.variables, *(parts.split.affine if pool.mixed else ())]
+    unit = _spread(box)[variables]
     slopes = [ca.jacobian(p, z[group.variables[i]]) * unit[i] for p, i in zip(phi, owner, strict=True)]
     value, slope = ca.Function("phi", [z], [ca.vertcat(*phi), ca.densify(ca.vertcat(*slopes))])(pool.z.T)
     y, dy = pool.value[index], None if pool.gradient is None else pool.gradient[index]
@@ -166,9 +168,29 @@ def _samples(box: Box, group: Group, pool: Pool, index: int, angles: bool) -> tu
     spread = np.sqrt(np.square(y - mean).mean(axis=0))
     spread = np.where(spread > 1e-12 * np.abs(y).max(axis=0), spread, 1.0)
     as_tensor = torch.from_numpy
-    return (fit.Samples(as_tensor(value.full().T), as_tensor(slope.full().T), torch.tensor(owner),
-                        as_tensor((y - mean) / spread),
-                        None if dy is None else as_tensor(dy * unit / spread[:, None])), mean, spread)
+    mix, of = _mix(parts, group, pool.z, unit) if pool.mixed else (None, None)
+    samples = fit.Samples(as_tensor(value.full().T), as_tensor(slope.full().T), torch.tensor(owner),
+                          as_tensor((y - mean) / spread),
+                          None if dy is None else as_tensor(dy * unit / spread[:, None]), mix)
+    if of is not None:  # a row's mean is its first coefficient's, the only one whose weight is 1 everywhere
+        row, column = of
+        mean, spread = np.where(column == 0, mean[row], 0.0), spread[row]
+    return samples, mean, spread
+
+
+def _mix(parts: Structure, group: Group, z: Array,
+         unit: Array) -> tuple[fit.Mix, tuple[NDArray[np.intp], NDArray[np.intp]]]:
+    """How coefficients make labels of rows of xdot, and each one's (row among the group's, column of the split)."""
+    split, rows = parts.split, parts.rows(group)
+    entries = np.array([e for expansion in parts.expansions for e in expansion.entries])[list(group.coefficients)]
+    row, column = np.searchsorted(rows, entries // split.columns), entries % split.columns
+    w = list(split.affine)
+    weights = np.hstack([np.ones((len(z), 1)), (z[:, w] - split.w0) / split.h])
+    place = np.zeros((len(rows), len(entries), split.columns))
+    place[row, np.arange(len(entries)), column] = 1.0
+    rate = np.zeros((split.columns, len(unit)))
+    rate[1:, len(group.variables):] = np.diag(unit[len(group.variables):] / split.h)
+    return fit.Mix(*map(torch.from_numpy, (weights, place, rate))), (row, column)
 
 
 class Draws:
@@ -190,10 +212,9 @@ class Draws:
         self.scale = torch.cat([self.scale, each])
 
     @property
-    def labels(self) -> tuple[int, int]:
-        """(values and derivatives of each output, outputs)."""
-        n, m = self.samples.y.shape
-        return n * (1 + self.variables), m
+    def labels(self) -> int:
+        """Numbers to meet."""
+        return self.samples.y.numel() * (1 + self.variables)
 
     def __call__(self, n: int) -> tuple[fit.Batch, Tensor]:
         N = len(self.samples)

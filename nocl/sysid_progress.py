@@ -48,8 +48,11 @@ class Checkpoint:
     meta: Mapping[str, Any]
 
     @staticmethod
-    def at(folder: str | Path | None, system: System, seed: int, settings: Settings) -> Checkpoint:
-        meta = {"system": system.to_data(), "seed": seed, "settings": asdict(settings)}
+    def at(folder: str | Path | None, system: System, seed: int, settings: Settings, learned: str,
+           data: str) -> Checkpoint:
+        """Of networks for a structure in words, from data with this digest."""
+        meta = {"system": system.to_data(), "seed": seed, "settings": asdict(settings), "structure": learned,
+                "data": data}
         return Checkpoint(None if folder is None else Path(folder), meta)
 
     def _path(self, index: int) -> Path:
@@ -62,8 +65,8 @@ class Checkpoint:
             return None
         state, meta = store.load_checkpoint(self._path(index))
         if meta != self.meta:
-            raise ValueError(f"{self._path(index)} is of another system, seed or settings; expected the same call as "
-                             "the one that is resumed: use another checkpoint folder")
+            raise ValueError(f"{self._path(index)} is of another system, data, seed or settings; expected the same "
+                             "call as the one that is resumed: use another checkpoint folder")
         return list(state)
 
     def put(self, index: int, weights: fit.Weights) -> None:

@@ -275,8 +275,6 @@ def test_settings_and_stated_equations_that_cannot_be(log):
         identify(s, data=log, method="paper")
     with pytest.raises(ValueError, match="takes LogSettings"):
         identify(s, data=log, settings=nocl.sysid.Settings())
-    with pytest.raises(ValueError, match="control_affine is for"):
-        identify(s, data=dataset(log), control_affine=True)
 
 
 def test_known_rows_beside_labels():

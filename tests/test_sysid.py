@@ -128,6 +128,9 @@ def test_a_checkpoint_is_not_trained_again(tmp_path):
     assert [(p, p.stat().st_mtime_ns) for p in sorted(tmp_path.iterdir())] == before
     with pytest.raises(ValueError, match="another checkpoint folder"):
         identify(cartpole.system(), seed=1, settings=settings, progress=False, checkpoint=tmp_path)
+    with pytest.raises(ValueError, match="of another system, data"):
+        identify(cartpole.system(), data=Dataset.sample(cartpole.system(), 15), settings=settings, progress=False,
+                 checkpoint=tmp_path)
 
 
 def test_refine_lowers_the_error_where_solutions_go():
@@ -164,7 +167,7 @@ def test_the_widest_network_has_half_as_many_weights_as_labels(features, outputs
     def weights(h):
         return h * (features + 1) + h * (h + 1) + outputs * (h + 1 + features)
 
-    h = _widest(features, (rows, outputs))
+    h = _widest(features, outputs, rows * outputs)
     assert h == NARROWEST or weights(h) <= rows * outputs / 2
     assert weights(h + 1) > rows * outputs / 2
 
