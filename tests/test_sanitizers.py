@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import nocl
+from nocl.kernels import CACHE_VARIABLE
 from nocl.solvers.ddp import DDP
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -34,6 +35,21 @@ for n in (1, W, 2 * W + 1):
     x0[n // 2] *= 1e30  # one that blows up, far from where sines are polynomials
     s = d.solve(x0, curvature=n > 1)
     d.solve(x0, u=s.u, x=s.x, gain=s.gain)
+print("clean")
+"""
+VALUE = """
+import itertools, torch
+from nocl.nets import MLP
+from nocl.solvers.cnd.value_kernel import ValueKernel
+for sizes, nx, dtype in itertools.product(([3, 5, 4], [7, 17, 16, 3]), (1, 4), (torch.float32, torch.float64)):
+    torch.manual_seed(0)
+    mlp, n, nz = MLP(sizes, "tanh", skip=True).to(dtype), 37, sizes[0]
+    kernel = ValueKernel(mlp, *(torch.rand(n, k, dtype=dtype) for k in (sizes[0], nz)), torch.arange(nz) % sizes[0],
+                         torch.arange(nz) % nx, *(torch.rand(n, k, dtype=dtype) for k in (nx, 1, 1, 1)), 1e-3)
+    for batch in (1, 2, 15, 16, 17, 63, 64, 65, 130):
+        loss = kernel(torch.cat([torch.tensor([n - 1]), torch.randint(n, (batch - 1,))]))
+        loss.backward()
+        assert torch.isfinite(loss)
 print("clean")
 """
 BROKEN = """
@@ -66,6 +82,14 @@ def sanitized(script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize(("name", "kind"), [("acrobot", "exact"), ("dubins", "looped"), ("cartpole", "learned")])
 def test_kernels_are_clean(name, kind, tmp_path):
     done = sanitized(SCRIPT, str(tmp_path), name, kind)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert done.stdout.strip() == "clean"
+
+
+@pytest.mark.slow
+def test_the_loss_of_v_is_clean(tmp_path, monkeypatch):
+    monkeypatch.setenv(CACHE_VARIABLE, str(tmp_path))
+    done = sanitized(VALUE)
     assert done.returncode == 0, done.stderr[-3000:]
     assert done.stdout.strip() == "clean"
 
