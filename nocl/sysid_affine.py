@@ -1,7 +1,8 @@
 """Whether labels that are given are affine in the controls, xdot = a(x) + B(x) u: scattered rows do not show it.
 
 Where the labels are nocl's to choose, structure.find moves the controls alone. No two given rows share all else, so it
-is tried on some of them: two fits, one with and one without, and the smaller error on rows kept apart.
+is tried on some of them: two fits, one with and one without, and the smaller error of Jacobians
+on rows kept apart: there are more numbers in them than in values.
 """
 
 from __future__ import annotations
@@ -36,5 +37,5 @@ def better_affine(source: Source, found: Structure, settings: Settings, seed: in
     errors = []
     for parts in (found, candidate):
         weights = fit_groups(part, parts, settings, seed, bar, Checkpoint(None, {}))
-        errors.append(score_of(assemble(parts, weights, settings.angles), apart).mean)
+        errors.append(score_of(assemble(parts, weights, settings.angles), apart).jacobian)
     return candidate if errors[1] < errors[0] else found
