@@ -32,6 +32,21 @@ def affine_in_controls(found: Structure) -> Structure | None:
     return replace(structure, words=describe(structure))
 
 
+def stated_affine(found: Structure) -> Structure | None:
+    """The structure where the controls are stated to be affine; None where networks would see controls alone.
+
+    ValueError where a closed form that the labels show contradicts the statement.
+    """
+    box = found.split.box
+    z = ca.SX.sym("z", box.nz)
+    for name, row in zip(box.names, ca.vertsplit(found.linear(z)[0]), strict=False):
+        if ca.jacobian(ca.jacobian(row, z[box.nx:]), z[box.nx:]).nnz():
+            raise ValueError(f"identify: the labels show that d {name}/dt is not affine in the controls; expected "
+                             "xdot = a(x) + B(x) u: leave control_affine out")
+    sees_controls = any(k >= box.nx for group in found.groups for k in group.variables)
+    return affine_in_controls(found) if sees_controls else found
+
+
 def split_at(box: Box, w: Sequence[int]) -> Split:
     """The split by these affine controls, each from the point nearest to 0 to the farther end of its bounds."""
     w0 = np.clip(0.0, box.lb[list(w)], box.ub[list(w)])

@@ -100,9 +100,11 @@ def initial(n_features: int, width: int, samples: Samples, generator: torch.Gene
     if samples.mix is None:
         c = torch.linalg.lstsq(phi, y, driver="gelsd").solution.T.float()
     else:
-        mix = torch.einsum("bj,mcj->bmc", samples.mix.weights[some], samples.mix.place).double()
-        basis = torch.einsum("bmc,bf->bmcf", mix, phi).flatten(2).flatten(0, 1)
-        c = torch.linalg.lstsq(basis, y.reshape(-1, 1), driver="gelsd").solution.view(samples.outputs, -1).float()
+        c = torch.zeros(samples.outputs, phi.shape[1])
+        for m, place in enumerate(samples.mix.place):
+            own, column = place.nonzero(as_tuple=True)
+            basis = (samples.mix.weights[some][:, column, None] * phi[:, None]).flatten(1).double()
+            c[own] = torch.linalg.lstsq(basis, y[:, m:m + 1], driver="gelsd").solution.view(len(own), -1).float()
     return [W1, W2, torch.cat([torch.zeros(len(c), h), c[:, -1:], c[:, :-1]], 1)]
 
 
@@ -179,22 +181,22 @@ def _cosine(progress: float) -> float:
 
 
 def levenberg_marquardt(weights: Weights, draw: Draw, *, steps: int, batch: int, report: Report) -> Weights:
-    """Damped Gauss-Newton steps, each on a fresh batch and kept only if it lowers the loss there; float64 weights.
+    """Damped Gauss-Newton steps, all on one batch, each kept only if it lowers the loss; float64 weights.
 
-    The damping is in units of the diagonal of J'J: x 0.2 on success, x 4 on failure.
+    The damping is in units of the diagonal of J'J: x 0.2 on success, x 4 on failure. Fresh batches would keep it up:
+    what one step gains, the next batch does not see.
     """
-    weights, damping = [w.detach().double() for w in weights], 1e-4
+    weights, damping, (now, scale) = [w.detach().double() for w in weights], 1e-4, draw(batch)
     for _ in range(steps):
-        now, scale = draw(batch)
         JJ, Jr, before = gauss_newton(weights, now, scale)
         for _ in range(8):
             candidate = _step(weights, JJ, Jr, damping)
             after = float(loss(candidate, now, scale)) if candidate is not None else math.inf
             if candidate is not None and after < before:
-                weights, damping = candidate, max(0.2 * damping, 1e-12)
+                weights, before, damping = candidate, after, max(0.2 * damping, 1e-12)
                 break
             damping = min(4 * damping, 1e6)
-        report(min(before, after) ** 0.5)
+        report(before ** 0.5)
     return weights
 
 
@@ -245,15 +247,17 @@ def _add(JJ: Tensor, Jr: Tensor, J: Tensor, r: Tensor, own: int) -> None:
 
 
 def _add_mixed(JJ: Tensor, Jr: Tensor, J: Tensor, mix: Tensor, r: Tensor, scale: Tensor, own: int) -> None:
-    """Labels see all outputs, with the weights of mix [1+k, B, m, C]."""
-    hidden, C = J.shape[3] - own, J.shape[0]
+    """A label's residuals see the rows of W3 of its own outputs, with the weights of mix [1+k, B, m, C]."""
+    hidden = J.shape[3] - own
     for m in range(mix.shape[2]):
-        each = mix[0, :, m].T[:, None, :, None] * J  # [C, 1+k, B, .]
-        each[:, 1:] += mix[1:, :, m].permute(2, 0, 1)[..., None] * J[:, :1]
-        row = torch.cat([each[..., :hidden].sum(dim=0), *(each[c, :, :, hidden:] for c in range(C))], 2)
+        outputs = mix[:, :, m].abs().amax(dim=(0, 1)).nonzero()[:, 0]
+        each = mix[0, :, m, outputs].T[:, None, :, None] * J[outputs]  # [own outputs, 1+k, B, .]
+        each[:, 1:] += mix[1:, :, m, outputs].permute(2, 0, 1)[..., None] * J[outputs, :1]
+        row = torch.cat([each[..., :hidden].sum(dim=0), each[..., hidden:].permute(1, 2, 0, 3).flatten(2)], 2)
         row = (row * scale[:, :, m, None]).flatten(0, 1)
-        JJ += _upper(row)
-        Jr += (row.T @ r[:, :, m].reshape(-1).float()).double()
+        place = torch.cat([torch.arange(hidden), (hidden + own * outputs[:, None] + torch.arange(own)).flatten()])
+        JJ[place[:, None], place] += _upper(row)
+        Jr[place] += (row.T @ r[:, :, m].reshape(-1).float()).double()
 
 
 def _upper(J: Tensor) -> Tensor:

@@ -209,9 +209,18 @@ class Structure:
         return self.split.columns * sum(expansion.terms for expansion in self.expansions)
 
     def rows(self, group: Group) -> tuple[int, ...]:
-        """The rows of xdot that the group's coefficients are in; of expansions without variables."""
-        own = [e for expansion in self.expansions for e in expansion.entries]
+        """The rows of xdot that the group's coefficients are in."""
+        own = self._entries()
         return tuple(sorted({own[c] // self.split.columns for c in group.coefficients}))
+
+    def controls(self, group: Group) -> tuple[int, ...]:
+        """The affine controls that the group's coefficients are multiplied by, as indices into z."""
+        own, columns = self._entries(), self.split.columns
+        return tuple(sorted({self.split.affine[j - 1] for c in group.coefficients if (j := own[c] % columns)}))
+
+    def _entries(self) -> list[int]:
+        """That each coefficient belongs to."""
+        return [e for expansion in self.expansions for e in expansion.entries for _ in range(expansion.terms)]
 
     def residual(self, oracle: Oracle, z: Array) -> tuple[Array, Array]:
         """The networks' labels: coefficients [N, C] and gradients [N, C, nz] at rows z, less their exact parts."""
@@ -571,9 +580,9 @@ def describe(structure: Structure) -> str:
         c += n * len(expansion.entries)
     words += [f"{_derivative(box, i)} = {_formula(structure, i)} exact" for i in range(box.nx) if i not in rows]
     words += polynomial
-    of = _and(_derivative(box, i) for i in sorted(rows)) if rows else ""
-    words += [f"{_count(len(g.coefficients))} of {of} learned as functions of {_and(box.names[k] for k in g.variables)}"
-              for g in structure.groups]
+    for g in structure.groups:
+        of, by = _and(_derivative(box, i) for i in structure.rows(g)), _and(box.names[k] for k in g.variables)
+        words.append(f"{_count(len(g.coefficients))} of {of} learned as functions of {by}")
     return "; ".join(words)
 
 

@@ -177,7 +177,8 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
     settings : Settings, (method "paper") PaperSettings or (logs) LogSettings
         Budgets and sizes.
     checkpoint : folder
-        Finished networks are kept there, and not trained again when the same call is repeated ("paper", logs: unused).
+        Finished networks are kept there, and not trained again when the same call is repeated ("paper", logs: unused;
+        the trials of given labels are made again).
 
     Raises
     ------
@@ -201,7 +202,8 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
         parts = find_structure(source, settings, seed, stated)
         if settings.structure and not stated.control_affine:
             parts = better_affine(source, parts, settings, seed, bar)
-        kept = Checkpoint.at(checkpoint, system, seed, settings, parts.words, source.digest)
+        kept = Checkpoint.at(checkpoint, system, seed, settings, {
+            "structure": _structure_data(parts), "gradients": source.gradients, "data": source.digest})
         weights = fit_groups(source, parts, settings, seed, bar, kept)
         net, words = assemble(parts, weights, settings.angles), parts.words
     card = {"method": method, "gradients": source.gradients, "seed": seed, "settings": asdict(settings),

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 from nocl import structure as structures
-from nocl.affine import affine_in_controls
+from nocl.affine import stated_affine
 from nocl.checks import Array
 from nocl.data import Dataset
 from nocl.known import Stated
@@ -111,7 +111,11 @@ def find_structure(source: Source, settings: Settings, seed: int, stated: Stated
         value, gradient = value.copy(), gradient.copy()
         value[:, list(stated.rows)], gradient[:, list(stated.rows)] = 0.0, 0.0
         found = structures.read(z, value, gradient, source.box, features=settings.features)
-        found = affine_in_controls(found) or found if stated.control_affine else found
+        if stated.control_affine:
+            affine = stated_affine(found)
+            if affine is None:
+                return stated.plain(source.box)
+            found = affine
     if not stated.rows:
         return found
     whole = stated.add(found)
@@ -122,7 +126,7 @@ def find_structure(source: Source, settings: Settings, seed: int, stated: Stated
 class Pool:
     """What the networks learn from: rows z, and by group labels of its coefficients, or (mixed) of its rows of xdot.
 
-    Gradients are by the group's variables, those of mixed labels by the affine controls after them.
+    Gradients are by the group's variables, those of mixed labels by its affine controls after them.
     """
 
     z: Array  # [N, nz]
@@ -146,7 +150,7 @@ def _given(z: Array, value: Array, gradient: Array | None, parts: Structure) -> 
     known, slope = structures.evaluate(structures.with_jacobian(symbol, [parts.xdot({}, symbol)]), z)
     values, slopes = [], []
     for group in parts.groups:
-        rows, variables = list(parts.rows(group)), [*group.variables, *parts.split.affine]
+        rows, variables = list(parts.rows(group)), [*group.variables, *parts.controls(group)]
         values.append((value - known)[:, rows])
         if gradient is not None:
             slopes.append((gradient[:, rows] - slope[:, rows])[:, :, variables])

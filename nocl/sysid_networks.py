@@ -159,8 +159,8 @@ def _samples(parts: Structure, pool: Pool, index: int, angles: bool) -> tuple[fi
     """(normalised samples of a group, the mean and spread that its network's outputs were normalised by)."""
     box, group, z = parts.split.box, parts.groups[index], ca.SX.sym("z", parts.split.box.nz)
     phi, owner = _features(box, group, z, angles)
-    variables = [*group.variables, *(parts.split.affine if pool.mixed else ())]
-    unit = _spread(box)[variables]
+    controls = parts.controls(group) if pool.mixed else ()
+    unit = _spread(box)[[*group.variables, *controls]]
     slopes = [ca.jacobian(p, z[group.variables[i]]) * unit[i] for p, i in zip(phi, owner, strict=True)]
     value, slope = ca.Function("phi", [z], [ca.vertcat(*phi), ca.densify(ca.vertcat(*slopes))])(pool.z.T)
     y, dy = pool.value[index], None if pool.gradient is None else pool.gradient[index]
@@ -182,14 +182,15 @@ def _mix(parts: Structure, group: Group, z: Array,
          unit: Array) -> tuple[fit.Mix, tuple[NDArray[np.intp], NDArray[np.intp]]]:
     """How coefficients make labels of rows of xdot, and each one's (row among the group's, column of the split)."""
     split, rows = parts.split, parts.rows(group)
-    entries = np.array([e for expansion in parts.expansions for e in expansion.entries])[list(group.coefficients)]
+    entries = np.array([e for x in parts.expansions for e in x.entries])[list(group.coefficients)]
     row, column = np.searchsorted(rows, entries // split.columns), entries % split.columns
     w = list(split.affine)
     weights = np.hstack([np.ones((len(z), 1)), (z[:, w] - split.w0) / split.h])
     place = np.zeros((len(rows), len(entries), split.columns))
     place[row, np.arange(len(entries)), column] = 1.0
     rate = np.zeros((split.columns, len(unit)))
-    rate[1:, len(group.variables):] = np.diag(unit[len(group.variables):] / split.h)
+    for i, k in enumerate(parts.controls(group), len(group.variables)):
+        rate[1 + w.index(k), i] = unit[i] / split.h[w.index(k)]
     return fit.Mix(*map(torch.from_numpy, (weights, place, rate))), (row, column)
 
 

@@ -34,7 +34,7 @@ def both(system: nocl.System, n: int, seed: int = 3) -> tuple[Dataset, Dataset]:
 
 def slope_in_u(model: LearnedDynamics, u: float) -> torch.Tensor:
     x = torch.tensor([[0.3, -0.2]], dtype=torch.float64)
-    return torch.func.jacfwd(lambda c: model(x, c)[0])(torch.tensor([[u]], dtype=torch.float64))[:, 0, 0]
+    return torch.func.jacfwd(lambda c: model(x, c)[0])(torch.tensor([[u]], dtype=torch.float64))[:, 0, 0].detach()
 
 
 def mixture(n: int = 50) -> tuple[fit.Samples, fit.Weights]:
