@@ -25,6 +25,15 @@ OPTIMUM = cell("optimum", [4.0, 4.0, 5.0], [0.04, 0.04, 0.05], [0.01] * 3, [0.1]
 CND = cell("cnd", [4.2, 4.4, 9.0], [0.042, 0.044, math.inf], [0.01, 0.01, math.inf], [0.1] * 3)
 
 
+def test_a_state_that_a_controller_has_no_answer_to_does_not_stop_the_clock():
+    """Level sets: NaN outside their box, and states that are not finite are refused."""
+    def controller(x, t):
+        assert np.isfinite(x).all()
+        return np.where(x[:, :1] < -2.0, [[0.5, 0.0]], np.nan)
+
+    assert dubins.rollout_ms(nocl.load_ocp("dubins"), controller, X0) > 0
+
+
 def test_lengths_are_those_of_the_driven_curve():
     """Half of the speed for 8 s: 4 m, in open loop; NaN controls are a failure, not a length."""
     ocp = nocl.load_ocp("dubins")

@@ -128,9 +128,19 @@ def test_a_checkpoint_is_not_trained_again(tmp_path):
     assert [(p, p.stat().st_mtime_ns) for p in sorted(tmp_path.iterdir())] == before
     with pytest.raises(ValueError, match="another checkpoint folder"):
         identify(cartpole.system(), seed=1, settings=settings, progress=False, checkpoint=tmp_path)
-    with pytest.raises(ValueError, match="of another system, data"):
-        identify(cartpole.system(), data=Dataset.sample(cartpole.system(), 15), settings=settings, progress=False,
-                 checkpoint=tmp_path)
+    for change in ({"gradients": False}, {"data": Dataset.sample(first.system, 15)}):
+        with pytest.raises(ValueError, match="of another system, data"):
+            identify(cartpole.system(), settings=settings, progress=False, checkpoint=tmp_path, **change)
+
+
+def test_a_checkpoint_is_of_its_labels(tmp_path):
+    """The same rows with other values, or known otherwise, are another call."""
+    settings, system = Settings(iterations=5, polish=1), pendulum.system()
+    data = Dataset.sample(system, 15)
+    identify(system, data=data, gradients=False, settings=settings, progress=False, checkpoint=tmp_path)
+    for change in ({"data": dataclasses.replace(data, xdot=2 * data.xdot)}, {"data": data, "known": ["theta"]}):
+        with pytest.raises(ValueError, match="of another system, data"):
+            identify(system, gradients=False, settings=settings, progress=False, checkpoint=tmp_path, **change)
 
 
 def test_refine_lowers_the_error_where_solutions_go():

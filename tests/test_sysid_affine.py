@@ -11,9 +11,13 @@ import nocl
 from nocl import fit
 from nocl.affine import affine_in_controls
 from nocl.data import Dataset
+from nocl.known import Stated
 from nocl.structure import Box, read
 from nocl.sysid import LearnedDynamics, Settings, identify
-from nocl.sysid_labels import box_of
+from nocl.sysid_affine import better_affine
+from nocl.sysid_labels import Source, box_of, draw_pool, find_structure
+from nocl.sysid_networks import _samples
+from nocl.sysid_progress import Progress
 from nocl.systems import cartpole
 
 SMALL = Settings(width=16, iterations=200, batch=256, polish=25, polish_batch=256)
@@ -84,6 +88,86 @@ def test_gauss_newton_of_mixed_labels_is_automatic_differentiation():
     torch.testing.assert_close(JJ, J.T @ J / 50, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(Jr, J.T @ r / 50, rtol=1e-4, atol=1e-4)
     assert square == pytest.approx(float(r @ r) / 50, rel=1e-12)
+
+
+def three_controls() -> nocl.System:
+    """Boxes of controls off 0, a negative step, an angle, rows with different controls, known linear terms."""
+    th, v, q, s, a, b, c = (ca.SX.sym(n) for n in ("th", "v", "q", "s", "a", "b", "c"))
+    xdot = ca.vertcat(v, ca.sin(th) * ca.exp(ca.cos(th)) + ca.exp(ca.sin(th)) * a + 3 * b,
+                      ca.tanh(q * s) + ca.exp(-q * q) * b + ca.sin(q + s) * c - 2 * a,
+                      ca.exp(ca.sin(s)) * c * ca.tanh(q) + v / 2)
+    return nocl.System("three", x=ca.vertcat(th, v, q, s), u=ca.vertcat(a, b, c), xdot=xdot, lbu=[-3, 1, -1],
+                       ubu=[-1, 2, 0.5], lbx=[-3, -1, -1, -1], ubx=[3, 1, 1, 1], angles=["th"])
+
+
+@pytest.mark.parametrize("known", [None, {"q": ca.SX(0)}])
+def test_exact_coefficients_meet_the_labels(known):
+    """Coefficients that the exact f has, mixed, are the given labels, values and derivatives, to rounding."""
+    system = three_controls()
+    if known is not None:
+        known = {"q": system.equations[2] + 0 * system.u[0] ** 2}
+    source = Source.of(system, Dataset.sample(system, 100, 3), True)
+    parts = find_structure(source, Settings(), 0, Stated.of(system, known, True))
+    pool = draw_pool(source, parts, Settings(), np.random.default_rng(0))
+    oracle = Source.of(system, None, True).oracle
+    exact, slope = parts.residual(oracle, pool.z)
+    assert parts.groups
+    for i, group in enumerate(parts.groups):
+        samples, mean, spread = _samples(parts, pool, i, True)
+        variables = [*group.variables, *parts.controls(group)]
+        unit = parts.split.box.width[variables] / np.sqrt(12)
+        c = list(group.coefficients)
+        y = (exact[:, c] - mean) / spread
+        dy = slope[:, c][:, :, variables] * unit / spread[:, None]
+        outputs = torch.from_numpy(np.concatenate([y[None], dy.transpose(2, 0, 1)]))
+        batch = samples.batch(torch.arange(100), torch.eye(len(variables)))
+        torch.testing.assert_close(fit.mixed(outputs, batch.mix), batch.y, rtol=0, atol=1e-12)
+
+
+def test_rows_kept_apart_are_not_fitted(monkeypatch):
+    seen = []
+    data = Dataset.sample(plant(), 100, 3)
+    source = Source.of(plant(), data, True)
+
+    def spy(part, parts, *_):
+        seen.append(part.data[0])
+        raise InterruptedError
+
+    monkeypatch.setattr("nocl.sysid_affine.fit_groups", spy)
+    parts = find_structure(source, Settings(), 0, Stated.of(plant(), None, False))
+    with pytest.raises(InterruptedError):
+        better_affine(source, parts, Settings(), 0, Progress("", False))
+    assert len(seen[0]) == 80
+    assert len(np.unique(seen[0], axis=0)) == 80
+
+
+def test_each_row_counts_in_its_own_unit():
+    """A row a thousand times larger, affine, does not make one affine that is not."""
+    p, v, u = ca.SX.sym("p"), ca.SX.sym("v"), ca.SX.sym("u")
+    xdot = ca.vertcat(1000 * (ca.sin(3 * p * v) + ca.exp(ca.sin(2 * p + v)) * u), ca.tanh(2 * u + p))
+    system = nocl.System("units", x=ca.vertcat(p, v), u=u, xdot=xdot, lbu=[-1], ubu=[1], lbx=[-1, -1], ubx=[1, 1])
+    model = identify(system, data=Dataset.sample(system, 100, 3), settings=SMALL, progress=False)
+    assert "affine" not in model.structure
+
+
+def test_a_statement_that_labels_contradict_is_refused_and_never_ignored():
+    p, v, u = ca.SX.sym("p"), ca.SX.sym("v"), ca.SX.sym("u")
+
+    def system(*rows):
+        return nocl.System("s", x=ca.vertcat(p, v), u=u, xdot=ca.vertcat(*rows), lbu=[-1], ubu=[1], lbx=[-1, -1],
+                           ubx=[1, 1])
+
+    square = system(u**2 * p, ca.exp(ca.sin(2 * p)) * u + ca.tanh(v * p))
+    data = Dataset.sample(square, 100, 3)
+    with pytest.raises(ValueError, match="d p/dt is not affine"):
+        identify(square, data=data, control_affine=True, settings=SMALL, progress=False)
+    stated = identify(square, data=data, control_affine=True, known=["p"], settings=SMALL, progress=False)
+    assert "affine in u" in stated.structure
+    noisy = system(2 * u, ca.exp(ca.sin(2 * p)) * u + ca.tanh(v * p))
+    data = Dataset.sample(noisy, 100, 3)
+    data = dataclasses.replace(data, B=data.B + 1e-4 * np.random.default_rng(0).standard_normal(data.B.shape))
+    model = identify(noisy, data=data, control_affine=True, settings=SMALL, progress=False)
+    torch.testing.assert_close(slope_in_u(model, -0.7), slope_in_u(model, 0.9), rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("gradients", [True, False])
