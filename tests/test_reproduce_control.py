@@ -200,3 +200,9 @@ def test_lqr_is_no_hidden_optimum():
     ocp = nocl.load_ocp("quadrotor")
     u = LQR(ocp)(np.r_[np.full(3, 1e4), np.zeros(9)], 3.9)
     assert np.abs(u).max() <= 100.0
+
+
+def test_slow_ways_have_fewer_states():
+    ways = control.TABLES["gym"].ways
+    assert [Plan("gym").states(ways[name]) for name in ("nmpc", "cnd")] == [5, 1000]
+    assert Plan("gym", n=3).states(ways["nmpc"]) == 3

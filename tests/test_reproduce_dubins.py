@@ -82,12 +82,6 @@ def test_success_needs_the_goal_and_the_obstacle():
     assert dubins.table([made])[0].collisions == 1
 
 
-def test_slow_ways_have_fewer_states():
-    assert dubins._key("nmpc", dubins.Plan())["n"] == dubins.WAYS["nmpc"].most
-    assert dubins._key("nmpc", dubins.Plan(n=20))["n"] == 20
-    assert dubins._key("optimum", dubins.Plan())["n"] == 1000
-
-
 def test_the_table_compares_with_the_optimum_of_the_same_states():
     entries = {e.way: e for e in dubins.table([CND, OPTIMUM])}
     assert list(entries) == ["cnd", "optimum"]

@@ -115,7 +115,7 @@ def finished(out: str | Path) -> list[Cell]:
 def make(way: str, seed: int, plan: Plan, folder: Path) -> Cell:
     """One cell, from nothing."""
     ocp = load_ocp("dubins")
-    x0 = ocp.initial_states.sample(_states(way, plan), 1 + seed)
+    x0 = ocp.initial_states.sample(plan.n, 1 + seed)
     controller, ms, made = WAYS[way].make(ocp, x0, seed, plan, folder)
     s, length = judged(ocp, controller, x0)
     turned = s.x[:, -1] - ocp.x_goal
@@ -230,19 +230,18 @@ def _paper(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
 
 @dataclass(frozen=True)
 class Way:
-    """A row of the table; `paper`: mean length, its s.d., seconds, success rate; `most`: states, where it is slow;
+    """A row of the table; `paper`: mean length, its s.d., seconds, success rate;
     `costed`: whether costs compare (RRT* turns round as often as it likes, and G counts that)."""
 
     title: str
     make: Callable[..., Made]
     paper: tuple[float, float, float, float] | None = None
-    most: int | None = None
     costed: bool = True
 
 
 WAYS = {"rrt-100": Way("RRT* (iter: 100)", _rrt(100), (4.8871, 0.9607, 6.9313, 0.889), costed=False),
         "rrt-200": Way("RRT* (iter: 200)", _rrt(200), (4.7343, 0.8451, 26.0595, 0.939), costed=False),
-        "nmpc": Way("NMPC", _nmpc, most=200), "level-sets": Way("HJB level sets", _level_sets),
+        "nmpc": Way("NMPC", _nmpc), "level-sets": Way("HJB level sets", _level_sets),
         "cnd-paper": Way("CND, the paper's method", _paper, (4.1076, 0.6916, 0.0634, 0.999)),
         "cnd": Way("CND, nocl's default, exact f", _pretrained("cnd")),
         "cnd-learned": Way("CND, nocl's default, learned f", _pretrained("cnd-learned")),
@@ -252,13 +251,8 @@ NEEDS = {"rrt-100": "ompl", "rrt-200": "ompl", "level-sets": "hj_reachability"}
 PLANS = {False: Plan(), True: Plan(n=20, grid=(24, 37, 41), paper_iterations=20, quick=True)}
 
 
-def _states(way: str, plan: Plan) -> int:
-    most = WAYS[way].most
-    return plan.n if most is None else min(plan.n, most)
-
-
 def _key(way: str, plan: Plan) -> dict[str, Any]:
-    key: dict[str, Any] = {"n": _states(way, plan)}
+    key: dict[str, Any] = {"n": plan.n}
     if way == "level-sets":
         key |= {"grid": list(plan.grid), "stretch": list(STRETCH), "penalty_slope": PENALTY_SLOPE, "margin": MARGIN}
     if way == "cnd-paper":
