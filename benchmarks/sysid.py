@@ -31,7 +31,7 @@ from nocl.systems import load_ocp
 
 BATCH, WIDTH, ROWS = 1024, 64, 100_000
 DOCS = Path(__file__).resolve().parents[1] / "docs"
-LABELS = (100, 300, 1000, 10_000, 100_000, 1_000_000)
+LABELS = (100, 300, 1000, 10_000, 1_000_000)
 DRAWN = (10, 200_000, 1_000_000)  # labels for the networks, at least 2,048 rows; those of the structure come beside
 # the same at every number of labels, with and without gradients
 BUDGETS = {"default": Settings(width=32, iterations=3000, batch=512, polish=100, polish_batch=512),

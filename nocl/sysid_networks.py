@@ -24,6 +24,7 @@ PROBES = 256  # rows at which the frequencies of the first layer are measured
 SHARE, LEAST = 0.7, 0.5  # of the measured frequencies, as first weights; and the least of these
 FULL_JACOBIAN = 6  # variables up to which every derivative is supervised, beyond it random directions
 PLAIN = 4  # variables beyond which a network without sines and cosines of angles is a plain one
+PER_WEIGHT = 4  # labels in a batch of Levenberg-Marquardt, at least: it would meet fewer of them and nothing between
 NARROWEST = 8  # wide, however few the labels
 SMOOTH = 0.5  # times the hidden layers' usual first weights, where labels are few
 LONGER = 3  # times as many Levenberg-Marquardt steps there: each is cheap, and they go on to gain
@@ -85,9 +86,10 @@ def _trained(weights: fit.Weights, draws: Draws, budget: Budget, lr: float, titl
             weights = fit.soap([w.float() for w in weights], draws.to(torch.float32), iterations=budget.iterations,
                                batch=budget.batch, lr=lr, report=report)
     if budget.polish and _can_be_polished(weights):
+        enough = -(-PER_WEIGHT * sum(w.numel() for w in weights) * len(draws.samples) // draws.labels)
         with bar.stage(f"{title}, Levenberg-Marquardt", budget.polish) as report:
-            weights = fit.levenberg_marquardt(weights, draws, steps=budget.polish, batch=budget.polish_batch,
-                                              report=report)
+            weights = fit.levenberg_marquardt(weights, draws, steps=budget.polish,
+                                              batch=max(budget.polish_batch, enough), report=report)
     return [w.double() for w in weights]
 
 
