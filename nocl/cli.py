@@ -112,11 +112,16 @@ def _add_tables(sub: argparse.ArgumentParser) -> None:
     tables = sub.add_subparsers(title="tables", metavar="TABLE", required=True)
 
     def table(name: str, run: Callable[[argparse.Namespace], None], text: str) -> argparse.ArgumentParser:
+        def started(args: argparse.Namespace) -> None:
+            args.out = args.out or Path("runs") / f"reproduce-{name}{'-quick' if args.quick else ''}"
+            run(args)
+
         one = tables.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-        one.set_defaults(command=run)
+        one.set_defaults(command=started)
         one.add_argument("--debug", action="store_true", help="show the traceback of an error")
-        one.add_argument("--out", type=_folder, default=Path("runs") / f"reproduce-{name}", metavar="DIR",
-                         help=f"default: runs/reproduce-{name}; what is finished there is not made again")
+        one.add_argument("--out", type=_folder, metavar="DIR",
+                         help=f"default: runs/reproduce-{name}, with --quick {name}-quick; what is finished there with "
+                              "the same settings is not made again, what has others is replaced")
         one.add_argument("--quick", action="store_true", help="small budgets: to see whether it works, not how well")
         return one
 
@@ -291,7 +296,8 @@ def _reproduce_approaches(args: argparse.Namespace) -> None:
 
     plan = approaches.Plan(nodes=15 if args.quick else 31, problems=args.problems or approaches.PROBLEMS)
     _check_out(args.out)
-    cells = approaches.run(args.out, plan)
+    approaches.run(args.out, plan)
+    cells = approaches.finished(args.out)
     paths = approaches.write(args.out, cells)
     print(approaches.markdown(cells), end="")
     print("written:", ", ".join(map(str, paths)))

@@ -30,11 +30,11 @@ from nocl.nets import MLP, FeatureNet
 from nocl.sampling import Seed
 from nocl.structure import Box, Expansion, Group, Split, Structure
 from nocl.sysid_affine import better_affine
-from nocl.sysid_labels import Source, box_of, data_box, find_structure, labelled, rows_of
+from nocl.sysid_labels import Source, box_of, data_box, find_structure, labelled, rows_of, some_labels
 from nocl.sysid_logs import first_states, fit_log
 from nocl.sysid_networks import assemble, fit_group, fit_groups, weights_of
 from nocl.sysid_progress import Checkpoint, Progress
-from nocl.sysid_score import Score, score_of
+from nocl.sysid_score import Score, contradictions, score_of
 from nocl.sysid_settings import LogSettings, PaperSettings, Settings
 from nocl.system import System
 from nocl.threads import one_thread
@@ -183,7 +183,13 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
     Raises
     ------
     ValueError
-        For settings, data or labels that cannot be used, with the remedy.
+        For settings, data or labels that cannot be used, with the remedy; for controls that are stated to be affine
+        where labels show a closed form, or are drawn and show that they are not.
+
+    Warns
+    -----
+    UserWarning
+        Where the labels speak against what is stated.
     """
     settings = _check_arguments(system, method, settings, seed, data)
     stated, start, bar = Stated.of(system, known, control_affine), time.perf_counter(), Progress(system.name, progress)
@@ -206,6 +212,7 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
             "structure": _structure_data(parts), "gradients": source.gradients, "data": source.digest})
         weights = fit_groups(source, parts, settings, seed, bar, kept)
         net, words = assemble(parts, weights, settings.angles), parts.words
+        _warn_of(contradictions(net, source.box, stated, *some_labels(source, 500, seed)) if stated else [])
     card = {"method": method, "gradients": source.gradients, "seed": seed, "settings": asdict(settings),
             "labels": source.labels, "seconds": round(time.perf_counter() - start, 3), "torch": torch.__version__}
     card["score"] = _score_text(system, net)
@@ -231,6 +238,12 @@ def _from_log(system: System, log: Log, stated: Stated, settings: LogSettings, s
             "seconds": round(time.perf_counter() - start, 3), "torch": torch.__version__,
             "score": f"simulation error on its own log, in units of the states' spread: {errors} steps"}
     return LearnedDynamics(system, net, parts.words, card, parts, Coverage.of(log, system))
+
+
+def _warn_of(contradictions: list[str]) -> None:
+    if contradictions:
+        warnings.warn(f"identify: the labels speak against what is stated, or the fit is poor: "
+                      f"{'; '.join(contradictions)}", UserWarning, stacklevel=3)
 
 
 def _check_stated(stated: Stated, method: str, source: Source) -> None:

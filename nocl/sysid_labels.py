@@ -104,6 +104,10 @@ def find_structure(source: Source, settings: Settings, seed: int, stated: Stated
     if source.oracle is not None:
         left = stated.residual(source.oracle, source.box.nx)
         found = structures.find(left, source.box, seed=seed, probes=settings.probes, features=settings.features)
+        bent = [source.box.names[k] for k in range(source.box.nx, source.box.nz) if k not in found.split.affine]
+        if stated.control_affine and bent:
+            raise ValueError(f"identify: the labels show that xdot is not affine in {', '.join(bent)}; expected xdot = "
+                             "a(x) + B(x) u: leave control_affine out")
     else:
         assert source.data is not None
         z, value, gradient = source.data
@@ -120,6 +124,21 @@ def find_structure(source: Source, settings: Settings, seed: int, stated: Stated
         return found
     whole = stated.add(found)
     return replace(whole, words=structures.describe(whole))
+
+
+def some_labels(source: Source, n: int, seed: int) -> tuple[Array, Array, Array | None]:
+    """(z, xdot, df/dz or None) at n rows: of the data, or drawn."""
+    rng = np.random.default_rng((seed, 5))
+    if source.data is not None:
+        rows = rng.permutation(len(source.data[0]))[:n]
+        z, value, gradient = source.data
+        return z[rows], value[rows], None if gradient is None else gradient[rows]
+    assert source.oracle is not None
+    z = source.box.sample(n, rng)
+    data = source.oracle(z[:, :source.box.nx], z[:, source.box.nx:])
+    if not source.gradients or data.A is None or data.B is None:
+        return z, data.xdot, None
+    return z, data.xdot, np.concatenate([data.A, data.B], axis=2)
 
 
 @dataclass(frozen=True, eq=False)

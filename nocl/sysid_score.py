@@ -10,7 +10,11 @@ from torch import Tensor
 
 from nocl.checks import Array
 from nocl.data import Dataset
+from nocl.known import Stated
 from nocl.nets import FeatureNet
+from nocl.structure import Box
+
+MISSED, BENT = 0.05, 0.3  # of their spread: what known rows, and slopes in affine controls, may miss the labels by
 
 
 @dataclass(frozen=True)
@@ -48,3 +52,23 @@ def value_and_jacobian(net: FeatureNet, x: Tensor, u: Tensor) -> tuple[Array, Ar
     y = net(z[:, : x.shape[1]], z[:, x.shape[1]:])
     rows = [torch.autograd.grad(y[:, i].sum() + 0 * z.sum(), z, retain_graph=True)[0] for i in range(y.shape[1])]
     return y.detach().numpy(), torch.stack(rows, 1).numpy()
+
+
+def contradictions(net: FeatureNet, box: Box, stated: Stated, z: Array, value: Array,
+                   gradient: Array | None) -> list[str]:
+    """What is stated and the labels speak against, in words: known rows, and slopes in affine controls."""
+    x, u = (torch.from_numpy(np.ascontiguousarray(a)) for a in np.split(z, [box.nx], axis=1))
+    answer, slope = value_and_jacobian(net, x, u)
+    said = [f"d {box.names[i]}/dt as it is known misses the labels by {100 * miss:.2g} % of their spread"
+            for i in stated.rows if (miss := _missed(answer[:, i], value[:, i])) > MISSED]
+    if stated.control_affine and gradient is not None:
+        said += [f"d {box.names[i]}/dt affine in the controls misses its slopes in {box.names[k]} by {100 * miss:.2g} "
+                 "% of their spread" for i in range(box.nx) if i not in stated.rows for k in range(box.nx, box.nz)
+                 if (miss := _missed(slope[:, i, k], gradient[:, i, k])) > BENT]
+    return said
+
+
+def _missed(answer: Array, label: Array) -> float:
+    """Root mean square of what is missed, over that of the labels about their mean, or a tenth of theirs."""
+    spread = max(float(label.std()), 0.1 * float(np.sqrt(np.square(label).mean())), np.finfo(np.float64).tiny)
+    return float(np.sqrt(np.square(answer - label).mean())) / spread

@@ -277,6 +277,7 @@ def test_settings_and_stated_equations_that_cannot_be(log):
         identify(s, data=log, settings=nocl.sysid.Settings())
 
 
+@pytest.mark.filterwarnings("ignore:identify. the labels speak against:UserWarning")  # five steps
 def test_known_rows_beside_labels():
     s = cartpole.system()
     settings = nocl.sysid.Settings(iterations=5, polish=1, samples=4000, structure=False)

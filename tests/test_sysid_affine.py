@@ -170,6 +170,23 @@ def test_a_statement_that_labels_contradict_is_refused_and_never_ignored():
     torch.testing.assert_close(slope_in_u(model, -0.7), slope_in_u(model, 0.9), rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("drawn", [True, False])
+def test_false_statements_are_told(drawn):
+    """What is bent is refused where labels are drawn, told where they are given; so are rows that are not as known."""
+    p, v, u = ca.SX.sym("p"), ca.SX.sym("v"), ca.SX.sym("u")
+    system = nocl.System("s", x=ca.vertcat(p, v), u=u, xdot=ca.vertcat(v, ca.exp(ca.sin(v)) + ca.sin(2 * u) * p),
+                         lbu=[-1], ubu=[1], lbx=[-1, -1], ubx=[1, 1])
+    given = {} if drawn else {"data": Dataset.sample(system, 200, 3)}
+    if drawn:
+        with pytest.raises(ValueError, match="not affine in u"):
+            identify(system, control_affine=True, settings=SMALL, progress=False)
+    else:
+        with pytest.warns(UserWarning, match="d v/dt affine in the controls misses its slopes in u"):
+            identify(system, control_affine=True, settings=SMALL, progress=False, **given)
+    with pytest.warns(UserWarning, match="d p/dt as it is known misses the labels by 1e"):
+        identify(system, known={"p": 2 * v}, settings=SMALL, progress=False, **given)
+
+
 @pytest.mark.parametrize("gradients", [True, False])
 def test_stated_affine_controls_are_affine(gradients):
     data = both(plant(), 300)[0 if gradients else 1]
@@ -192,10 +209,12 @@ def test_what_is_not_affine_is_not():
     data = both(plant(0.3), 60)[0]
     model = identify(plant(0.3), data=data, settings=SMALL, progress=False)
     assert "affine" not in model.structure
-    stated = identify(plant(0.3), data=data, control_affine=True, settings=SMALL, progress=False)
+    with pytest.warns(UserWarning, match="d v/dt affine in the controls"):
+        stated = identify(plant(0.3), data=data, control_affine=True, settings=SMALL, progress=False)
     assert model.score().mean < 0.5 * stated.score().mean
 
 
+@pytest.mark.filterwarnings("ignore:identify. the labels speak against:UserWarning")  # too few steps
 def test_the_model_is_saved_and_refined(tmp_path):
     model = identify(plant(), data=both(plant(), 60)[0], control_affine=True,
                      settings=dataclasses.replace(SMALL, iterations=30, polish=2), progress=False)

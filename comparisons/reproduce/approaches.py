@@ -20,8 +20,10 @@ import numpy as np
 from tqdm import tqdm
 
 from nocl import store
+from nocl.checks import Array
 from nocl.comparisons.reproduce.cells import read_cell
 from nocl.comparisons.reproduce.dubins import rollout_ms
+from nocl.ocp import OCP
 from nocl.solvers.compiled import fingerprint
 from nocl.systems import load_ocp
 
@@ -29,6 +31,7 @@ PROBLEMS = ("double_integrator", "pendulum", "dubins", "cartpole", "acrobot", "q
 WAYS = {"level-sets": "HJB level sets", "nmpc": "NMPC", "cnd": "CND"}
 CELLS = "cells"
 UNLIMITED = 1e12
+REFERENCE = 320  # intervals of DDP's optimum
 # of the paper's table of approaches: HJB-LSM, NMPC, CT-MBRL; None where it has a dash
 CLAIMS = {"solution over the entire state space": (True, False, True), "no space discretization": (False, True, True),
           "no requirement of true dynamics": (False, False, True), "sample efficiency": (None, True, False)}
@@ -64,6 +67,7 @@ class Cell:
     memory: float  # MB: of the grid's solver, or of the network's weights; NaN where it was not measured
     before: float  # s, until the first state can be answered
     ms: float  # a state's whole control trajectory
+    error: float  # mean |V - J| / J of its V, or of NMPC's cost, over the states; J the best of DDP's starts
     covers: str
     note: str
     key: dict[str, Any]
@@ -103,7 +107,7 @@ def _key(way: str, plan: Plan, problem: str) -> dict[str, Any]:
 
 
 def _read(path: Path) -> Cell:
-    return read_cell(path, Cell, "the table of approaches", ("memory", "before", "ms"))
+    return read_cell(path, Cell, "the table of approaches", ("memory", "before", "ms", "error"))
 
 
 def _level_sets(problem: str, plan: Plan) -> Cell:
@@ -115,18 +119,17 @@ def _level_sets(problem: str, plan: Plan) -> Cell:
     size = f"{float(plan.nodes) ** nx:.3g} nodes"
     if nx > 4:
         at_least = float(plan.nodes) ** nx * 8 / 1e6  # one array of doubles
-        return Cell(problem, nx, "level-sets", size, at_least, nan, nan, covers,
+        return Cell(problem, nx, "level-sets", size, at_least, nan, nan, nan, covers,
                     "not possible: a single array would need that memory", key)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # 4 states: the table says so
         grid = LevelSet(ocp, (plan.nodes,) * nx, max_memory=UNLIMITED, max_seconds=UNLIMITED, slices=11)
     if nx == 4:
         p = grid.predict()
-        return Cell(problem, nx, "level-sets", size, 1e3 * p.memory, p.seconds, nan, covers, "predicted", key)
-    solution = grid.solve()
-    ms = rollout_ms(ocp, solution, ocp.initial_states.sample(plan.states, 1))
-    return Cell(problem, nx, "level-sets", size, 1e3 * solution.prediction.memory, solution.seconds, ms, covers, "",
-                key)
+        return Cell(problem, nx, "level-sets", size, 1e3 * p.memory, p.seconds, nan, nan, covers, "predicted", key)
+    solution, x0 = grid.solve(), ocp.initial_states.sample(plan.states, 1)
+    return Cell(problem, nx, "level-sets", size, 1e3 * solution.prediction.memory, solution.seconds,
+                rollout_ms(ocp, solution, x0), _error(ocp, x0, solution.value(x0)), covers, "", key)
 
 
 def _nmpc(problem: str, plan: Plan) -> Cell:
@@ -137,10 +140,12 @@ def _nmpc(problem: str, plan: Plan) -> Cell:
     solver = NMPC(ocp, starts=1, passes=0)
     solver.solve(ocp.initial_states.sample(1, 0), progress=False)
     built = time.perf_counter() - start
-    solution = solver.solve(ocp.initial_states.sample(plan.states, 1), progress=False)
+    x0 = ocp.initial_states.sample(plan.states, 1)
+    solution = solver.solve(x0, progress=False)
     unknowns = solver.intervals * (ocp.system.nx + ocp.system.nu) + ocp.system.nx
     return Cell(problem, ocp.system.nx, "nmpc", f"{unknowns} unknowns", float("nan"), built,
-                float(1e3 * np.median(solution.seconds)), "one initial state, a local optimum", "one start a state",
+                float(1e3 * np.median(solution.seconds)), _error(ocp, x0, solution.cost),
+                "one initial state, a local optimum", "one start a state",
                 _key("nmpc", plan, problem))
 
 
@@ -148,11 +153,22 @@ def _cnd(problem: str, plan: Plan) -> Cell:
     ocp, nan, cnd, key = load_ocp(problem), float("nan"), _shipped(problem), _key("cnd", plan, problem)
     covers = "the initial states that it was trained for"
     if cnd is None:
-        return Cell(problem, ocp.system.nx, "cnd", "", nan, nan, nan, covers, "none ships with nocl", key)
+        return Cell(problem, ocp.system.nx, "cnd", "", nan, nan, nan, nan, covers, "none ships with nocl", key)
+    x0 = ocp.initial_states.sample(plan.states, 1)
     weights = sum(p.numel() for net in (cnd.policy, cnd.value_net) if net is not None for p in net.parameters())
     return Cell(problem, ocp.system.nx, "cnd", f"{weights} weights", weights * 8 / 1e6, _training_seconds(cnd),
-                rollout_ms(ocp, cnd, ocp.initial_states.sample(plan.states, 1)), covers,
+                rollout_ms(ocp, cnd, x0), _error(ocp, x0, cnd.value(x0, 0.0)), covers,
                 "its training's time as its card has it", key)
+
+
+def _error(ocp: OCP, x0: Array, V: Any) -> float:
+    """Mean |V - J| / J over the states; where V has no answer, the states are left out."""
+    from nocl.solvers.ddp import DDP
+    from nocl.solvers.global_search import solve_globally
+
+    best = solve_globally(DDP(ocp, intervals=REFERENCE), x0, seed=0).best
+    wrong = np.abs(np.asarray(V).ravel() - best.cost) / best.cost
+    return float(np.mean(wrong[best.success & np.isfinite(wrong)]))
 
 
 def _shipped(problem: str) -> Any:
@@ -183,12 +199,16 @@ def _number(x: float) -> str:
     return f"{x:.3g}" if np.isfinite(x) else "-"
 
 
+def _percent(x: float) -> str:
+    return f"{100 * x:.2g} %" if np.isfinite(x) else "-"
+
+
 def markdown(cells: Sequence[Cell]) -> str:
     """A row for each problem and way, by rising numbers of states."""
-    lines = ["| problem | states | way | size | memory, MB | s before | ms a state | covers | note |",
-             f"|{'---|' * 9}"]
+    lines = ["| problem | states | way | size | memory, MB | s before | ms a state | mean error | covers | note |",
+             f"|{'---|' * 10}"]
     lines += [f"| {c.problem} | {c.nx} | {WAYS[c.way]} | {c.size} | {_number(c.memory)} | {_number(c.before)} | "
-              f"{_number(c.ms)} | {c.covers} | {c.note} |" for c in cells]
+              f"{_number(c.ms)} | {_percent(c.error)} | {c.covers} | {c.note} |" for c in cells]
     marks = {True: "yes", False: "no", None: "-"}
     lines += ["", "What the paper says of them:", "", "| | HJB-LSM | NMPC | CT-MBRL |", f"|{'---|' * 4}"]
     lines += [f"| {claim} | {' | '.join(marks[m] for m in said)} |" for claim, said in CLAIMS.items()]
@@ -197,10 +217,10 @@ def markdown(cells: Sequence[Cell]) -> str:
 
 def latex(cells: Sequence[Cell]) -> str:
     """The measured part."""
-    lines = [r"\begin{tabular}{l r l r r r}", r"\toprule",
-             r"problem & states & way & memory (MB) & s before & ms a state \\", r"\midrule"]
+    lines = [r"\begin{tabular}{l r l r r r r}", r"\toprule",
+             r"problem & states & way & memory (MB) & s before & ms a state & error (\%) \\", r"\midrule"]
     lines += [f"{c.problem.replace('_', ' ')} & {c.nx} & {WAYS[c.way]} & {_number(c.memory)} & {_number(c.before)} & "
-              rf"{_number(c.ms)} \\" for c in cells]
+              rf"{_number(c.ms)} & {_number(100 * c.error)} \\" for c in cells]
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
 
 
