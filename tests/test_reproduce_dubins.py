@@ -144,7 +144,14 @@ def test_approaches_level_sets_end_where_memory_does(tmp_path):
     large = approaches.MAKERS["level-sets"]("quadrotor", plan)
     assert small.memory < 10
     assert small.ms > 0
+    assert 0 < small.error < 1
+    fine = approaches.MAKERS["level-sets"]("double_integrator", replace(plan, nodes=41))
+    assert fine.error < 0.5 * small.error
+    assert math.isnan(large.error)
     assert large.memory > 1e7  # MB
     assert "not possible" in large.note
-    text = approaches.write(tmp_path, [small, large])[0].read_text()
+    paths = approaches.write(tmp_path, [small, large])
+    assert [p.suffix for p in paths] == [".md", ".tex", ".csv", ".png"]
+    assert paths[3].read_bytes().startswith(b"\x89PNG")
+    text = paths[0].read_text()
     assert "| quadrotor | 12 | HJB level sets |" in text

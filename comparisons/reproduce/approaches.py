@@ -190,9 +190,30 @@ MAKERS = {"level-sets": _level_sets, "nmpc": _nmpc, "cnd": _cnd}
 
 
 def write(folder: str | Path, cells: Sequence[Cell]) -> list[Path]:
-    """approaches.md, .tex and .csv in the folder; their paths."""
+    """approaches.md, .tex, .csv and .png in the folder; their paths."""
     texts = {"md": markdown(cells), "tex": latex(cells), "csv": as_csv(cells)}
-    return [store.write_text(Path(folder) / f"approaches.{kind}", text) for kind, text in texts.items()]
+    paths = [store.write_text(Path(folder) / f"approaches.{kind}", text) for kind, text in texts.items()]
+    return [*paths, store.write_bytes(Path(folder) / "approaches.png", figure(cells))]
+
+
+def figure(cells: Sequence[Cell]) -> bytes:
+    """Memory, seconds before, milliseconds a state and mean error against the number of states, as PNG."""
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    from nocl.comparisons.style import COLOURS, STYLE, encode
+
+    quantities = {"memory": "memory, MB", "before": "s before", "ms": "ms a state", "error": "mean error of V"}
+    with matplotlib.rc_context(STYLE):
+        drawing = Figure(figsize=(12, 3), layout="constrained")
+        panels = drawing.subplots(1, len(quantities))
+        for axes, (name, title) in zip(panels, quantities.items(), strict=True):
+            for colour, (way, label) in zip(COLOURS, WAYS.items(), strict=False):
+                own = [c for c in cells if c.way == way]
+                axes.plot([c.nx for c in own], [getattr(c, name) for c in own], "o", color=colour, label=label)
+            axes.set(yscale="log", xlabel="states", title=title)
+        panels[0].legend(fontsize=7)
+        return bytes(encode(drawing, "png"))
 
 
 def _number(x: float) -> str:

@@ -319,7 +319,7 @@ QUADROTOR = Table("quadrotor", ("quadrotor",), {
     "r0-paper": Way("CND (R = 0), the paper's method", partial(_no_control_cost, _paper), True,
                     {"quadrotor": Published(0.4161, 0.1732, 72.4603, 18.6037)}),
     "r0": Way("CND (R = 0), nocl's default", partial(_no_control_cost, _default), True),
-    "nmpc": Way("NMPC", _nmpc, most=50),
+    "nmpc": Way("NMPC", _nmpc),
     "lqr": Way("LQR", _lqr),
     "neural-oc": Way("NeuralOC", _neural_oc, False, {"quadrotor": Published(0.4601, 0.1552, 45.9289, 17.8367)})})
 
