@@ -144,6 +144,7 @@ def test_tables_and_figures(tmp_path):
     text = paths[0].read_text()
     assert "| acrobot | CND, nocl's default | f_theta | 0.25 ± 0.05 | 0.2 .. 0.3 |" in text
     assert "| cartpole | CND, nocl's default | f_theta | 0.04 ± 0 |  |" in text  # one seed has no spread
+    assert text.count("not run yet") == 6
     assert "not run yet | 0.284 ± 0.1 | 4.62 ± 2.63 | 4789 |" in text  # the paper's Deep PILCO, beside nothing of ours
     widths = {line.count("|") for line in text.strip().splitlines()}
     assert len(widths) == 1

@@ -372,14 +372,16 @@ class Entry:
     evaluations: float
     ms: float
     n: int  # initial states of a seed
-    seeds: int  # 0: not run yet
+    seeds: int  # 0: not run
     made: str
 
 
 def table(cells: Sequence[Cell], name: str) -> list[Entry]:
-    """One entry a problem and way, in the order of the table; those without cells say that they have not been run."""
+    """One entry a problem and way, in the order of the table; those without cells say so."""
     t = TABLES[name]
-    return [_entry(p, w, [c for c in cells if (c.problem, c.way) == (p, w)]) for p in t.problems for w in t.ways]
+    entries = [_entry(p, w, [c for c in cells if (c.problem, c.way) == (p, w)]) for p in t.problems for w in t.ways]
+    return [replace(e, made=e.made or ("not run yet" if t.ways[e.way].make is None else "not in this run"))
+            for e in entries]
 
 
 def _entry(problem: str, way: str, cells: Sequence[Cell]) -> Entry:
@@ -392,7 +394,7 @@ def _entry(problem: str, way: str, cells: Sequence[Cell]) -> Entry:
     for what in ("seconds", "cpu", "identify", "evaluations", "ms"):
         known = [value for c in cells if not math.isnan(value := getattr(c, what))]
         numbers[what] = float(np.mean(known)) if known else math.nan
-    made = "; ".join(dict.fromkeys(c.made for c in cells)) or "not run yet"
+    made = "; ".join(dict.fromkeys(c.made for c in cells))
     return Entry(problem, way, **numbers, failed=sum(int((~np.isfinite(c.error)).sum()) for c in judged),
                  n=max((len(c.error) for c in judged), default=0), seeds=len(cells), made=made)
 
