@@ -210,16 +210,16 @@ class Structure:
 
     def rows(self, group: Group) -> tuple[int, ...]:
         """The rows of xdot that the group's coefficients are in."""
-        own = self._entries()
+        own = self.owners()
         return tuple(sorted({own[c] // self.split.columns for c in group.coefficients}))
 
     def controls(self, group: Group) -> tuple[int, ...]:
         """The affine controls that the group's coefficients are multiplied by, as indices into z."""
-        own, columns = self._entries(), self.split.columns
+        own, columns = self.owners(), self.split.columns
         return tuple(sorted({self.split.affine[j - 1] for c in group.coefficients if (j := own[c] % columns)}))
 
-    def _entries(self) -> list[int]:
-        """That each coefficient belongs to."""
+    def owners(self) -> list[int]:
+        """The entry that each coefficient belongs to."""
         return [e for expansion in self.expansions for e in expansion.entries for _ in range(expansion.terms)]
 
     def residual(self, oracle: Oracle, z: Array) -> tuple[Array, Array]:
@@ -569,12 +569,11 @@ def describe(structure: Structure) -> str:
     split, box = structure.split, structure.split.box
     words = [f"affine in {_and(box.names[k] for k in split.affine)}"] if split.affine else []
     learned = {c for group in structure.groups for c in group.coefficients}
-    rows: set[int] = set()
+    rows = {i for g in structure.groups for i in structure.rows(g)}
     polynomial, c = [], 0
     for expansion in structure.expansions:
         n = expansion.terms
         open_entries = [e for j, e in enumerate(expansion.entries) if learned & set(range(c + j * n, c + (j + 1) * n))]
-        rows |= {e // split.columns for e in open_entries}
         if open_entries and expansion.variables:
             polynomial.append(_polynomial_words(expansion, split, open_entries))
         c += n * len(expansion.entries)

@@ -198,7 +198,7 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
         return _from_log(system, data, stated, settings, seed, bar)
     assert not isinstance(settings, LogSettings)
     source = Source.of(system, data, gradients)
-    _check_stated(stated, method, source)
+    _check_stated(stated, method)
     if isinstance(settings, PaperSettings):
         net, parts = sysid_paper.train(source, settings, seed, bar), None
         words = "one network of all variables, as in the paper"
@@ -208,7 +208,7 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
         parts = find_structure(source, settings, seed, stated)
         if settings.structure and not stated.control_affine:
             parts = better_affine(source, parts, settings, seed, bar)
-        kept = Checkpoint.at(checkpoint, system, seed, settings, {
+        kept = Checkpoint(None, {}) if checkpoint is None else Checkpoint.at(checkpoint, system, seed, settings, {
             "structure": _structure_data(parts), "gradients": source.gradients, "data": source.digest})
         weights = fit_groups(source, parts, settings, seed, bar, kept)
         net, words = assemble(parts, weights, settings.angles), parts.words
@@ -246,7 +246,7 @@ def _warn_of(contradictions: list[str]) -> None:
                       f"{'; '.join(contradictions)}", UserWarning, stacklevel=3)
 
 
-def _check_stated(stated: Stated, method: str, source: Source) -> None:
+def _check_stated(stated: Stated, method: str) -> None:
     if stated and method == "paper":
         raise ValueError("identify: method 'paper' learns everything; expected no `known` and no `control_affine`: use "
                          "the default method")

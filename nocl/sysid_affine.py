@@ -37,19 +37,19 @@ def better_affine(source: Source, found: Structure, settings: Settings, seed: in
     part = replace(source, data=(z[rest], value[rest], gradient[rest]))
     short = replace(settings, polish=settings.budget(source.box.nz).polish // LONGER)
     rows = sorted({i for group in found.groups for i in found.rows(group)})
-    errors = []
+    unit, errors = _size(gradient, source.box.width), []
     for parts, title in ((found, "trial"), (candidate, "trial, affine in the controls")):
         weights = fit_groups(part, parts, short, seed, Progress(f"{bar.name}, {title}", bar.show), Checkpoint(None, {}))
         x, u = (torch.from_numpy(a) for a in np.split(z[kept], [source.box.nx], axis=1))
         slope = value_and_jacobian(assemble(parts, weights, settings.angles), x, u)[1]
         wrong = (slope - gradient[kept]) * source.box.width
-        errors.append(np.square(wrong).mean(axis=(0, 2))[rows] / gradient_size(gradient, source.box.width)[rows])
+        errors.append(np.square(wrong).mean(axis=(0, 2))[rows] / unit[rows])
     before, after = errors
     better = after.sum() < before.sum() and bool((after <= WORSE**2 * before).all())
     return candidate if better else found
 
 
-def gradient_size(gradient: Array, width: Array) -> Array:
+def _size(gradient: Array, width: Array) -> Array:
     """Mean square of each row's derivatives about their means, each times the width of its variable. [nx]"""
     size: Array = np.square((gradient - gradient.mean(axis=0)) * width).mean(axis=(0, 2))
     return size

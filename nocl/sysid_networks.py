@@ -184,7 +184,7 @@ def _mix(parts: Structure, group: Group, z: Array,
          unit: Array) -> tuple[fit.Mix, tuple[NDArray[np.intp], NDArray[np.intp]]]:
     """How coefficients make labels of rows of xdot, and each one's (row among the group's, column of the split)."""
     split, rows = parts.split, parts.rows(group)
-    entries = np.array([e for x in parts.expansions for e in x.entries])[list(group.coefficients)]
+    entries = np.array(parts.owners())[list(group.coefficients)]
     row, column = np.searchsorted(rows, entries // split.columns), entries % split.columns
     w = list(split.affine)
     weights = np.hstack([np.ones((len(z), 1)), (z[:, w] - split.w0) / split.h])

@@ -48,11 +48,10 @@ class Checkpoint:
     meta: Mapping[str, Any]
 
     @staticmethod
-    def at(folder: str | Path | None, system: System, seed: int, settings: Settings,
-           of: Mapping[str, Any]) -> Checkpoint:
+    def at(folder: str | Path, system: System, seed: int, settings: Settings, of: Mapping[str, Any]) -> Checkpoint:
         """Of networks for the same call, and what it found so far."""
         meta = {"system": system.to_data(), "seed": seed, "settings": asdict(settings), **of}
-        return Checkpoint(None if folder is None else Path(folder), meta)
+        return Checkpoint(Path(folder), meta)
 
     def _path(self, index: int) -> Path:
         assert self.folder is not None
