@@ -23,7 +23,7 @@ import provenance
 import nocl
 from nocl import solvers
 from nocl.comparisons import Report, study
-from nocl.comparisons.robustness import mass_variants
+from nocl.comparisons.disturbances import mass_variants
 
 PROBLEMS = ("cartpole", "acrobot", "quadrotor", "dubins")
 NAME = "compare"

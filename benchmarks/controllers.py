@@ -31,17 +31,17 @@ import provenance
 from ddp import problem as load_problem
 
 import nocl
-from nocl.checks import Array
 from nocl.comparisons.reference import SLOTS, resolved
+from nocl.judge import Simulation, simulate
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
-from nocl.simulate import Simulation, simulate
-from nocl.solvers.bank import SolutionBank, better
 from nocl.solvers.cnd import TrainSettings
 from nocl.solvers.cnd.labels import policy_controls
 from nocl.solvers.cnd.validate import feasible, kicked_optima, tube_optima, value_scores
-from nocl.solvers.ddp import DDP, DDPSolution
-from nocl.solvers.global_search import cold_controls, solve_globally
+from nocl.solvers.ddp.bank import SolutionBank, better
+from nocl.solvers.ddp.global_search import cold_controls, solve_globally
+from nocl.solvers.ddp.solver import DDP, DDPSolution
+from nocl.support.checks import Array
 
 FINE = 640  # intervals of the reference
 COLD = 48  # cold starts from each of the worst states

@@ -30,12 +30,12 @@ import numpy as np
 import provenance
 
 import nocl
-from nocl import store
 from nocl.solvers import NMPC
-from nocl.solvers.bank import SolutionBank
 from nocl.solvers.cnd.labels import tube_states
-from nocl.solvers.ddp import DDP
-from nocl.solvers.global_search import solve_globally
+from nocl.solvers.ddp.bank import SolutionBank
+from nocl.solvers.ddp.global_search import solve_globally
+from nocl.solvers.ddp.solver import DDP
+from nocl.support import store
 
 FIGURE = provenance.RESULTS.parents[1] / "docs" / "ddp_scaling.png"
 SECTIONS = ("speed", "share", "learned", "batch", "states")

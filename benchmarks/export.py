@@ -26,12 +26,12 @@ import torch
 sys.path.insert(0, str(Path(__file__).parent))
 import provenance
 
+from nocl.exports.c_code import to_c
+from nocl.exports.casadi_forms import to_casadi
+from nocl.exports.onnx_writer import Session, to_onnx
 from nocl.nets import MLP, FeatureNet
 from nocl.solvers import NMPC
 from nocl.solvers.cnd import CND, pretrained
-from nocl.to_c import to_c
-from nocl.to_casadi import to_casadi
-from nocl.to_onnx import Session, to_onnx
 
 BATCH = 10_000
 TIMER = """

@@ -27,11 +27,12 @@ sys.path.insert(0, str(Path(__file__).parent))
 import provenance
 
 import nocl
-from nocl.checks import Array
 from nocl.data import Solution
-from nocl.simulate import simulate
-from nocl.solvers import NMPC, guesses
+from nocl.judge import simulate
+from nocl.solvers import NMPC
 from nocl.solvers.cnd import CND, pretrained
+from nocl.solvers.nmpc import guesses
+from nocl.support.checks import Array
 
 SAME = 1e-3  # relative: costs closer than this are of one optimum
 

@@ -24,11 +24,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 import provenance
 
 import nocl
-from nocl.checks import Array
-from nocl.simulate import simulate
-from nocl.solvers.ddp import DDP, DDPSolution
-from nocl.solvers.global_search import solve_globally
-from nocl.sysid import LearnedDynamics, Settings, identify
+from nocl.judge import simulate
+from nocl.solvers.ddp.global_search import solve_globally
+from nocl.solvers.ddp.solver import DDP, DDPSolution
+from nocl.support.checks import Array
+from nocl.sysid.identification import LearnedDynamics, Settings, identify
 
 PROBLEMS = ("cartpole", "acrobot", "quadrotor", "dubins")
 COARSE, FINE, STARTS = 80, 320, 16

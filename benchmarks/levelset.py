@@ -19,11 +19,11 @@ import numpy as np
 import provenance
 
 import nocl
-from nocl.checks import Array
-from nocl.solvers.ddp import DDP
-from nocl.solvers.global_search import solve_globally
-from nocl.solvers.levelset import Refinement, refine
+from nocl.solvers.ddp.global_search import solve_globally
+from nocl.solvers.ddp.solver import DDP
+from nocl.solvers.levelset.solver import Refinement, refine
 from nocl.solvers.lqr import LQR
+from nocl.support.checks import Array
 
 INTERVALS, SEED = 400, 3
 

@@ -26,15 +26,15 @@ import provenance
 from learned_optimum import FINE, feedback, lost, optimum
 
 import nocl
-from nocl.checks import Array
-from nocl.integrate import rk4_interval
-from nocl.logs import Log
-from nocl.simulate import simulate
+from nocl.judge import simulate
 from nocl.solvers.cnd import TrainSettings
-from nocl.solvers.ddp import DDP
-from nocl.solvers.global_search import solve_globally
-from nocl.sysid import LearnedDynamics, LogSettings, identify
+from nocl.solvers.ddp.global_search import solve_globally
+from nocl.solvers.ddp.solver import DDP
+from nocl.support.checks import Array
+from nocl.sysid.identification import LearnedDynamics, LogSettings, identify
+from nocl.sysid.logs.log import Log
 from nocl.systems import acrobot, pendulum
+from nocl.translate.rk4 import rk4_interval
 
 STEPS = (1, 5, 10, 25, 50, 100)
 

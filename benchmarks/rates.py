@@ -20,12 +20,12 @@ sys.path.insert(0, str(Path(__file__).parent))
 import provenance
 
 import nocl
-from nocl.checks import Array
+from nocl.judge import simulate
 from nocl.ocp import OCP
-from nocl.simulate import simulate
 from nocl.solvers.cnd import TrainSettings
-from nocl.solvers.ddp import DDP
-from nocl.solvers.global_search import solve_globally
+from nocl.solvers.ddp.global_search import solve_globally
+from nocl.solvers.ddp.solver import DDP
+from nocl.support.checks import Array
 
 RATES = (40, 80, 160, None)  # held controls a horizon; None: continuous feedback
 FINE = 640

@@ -21,12 +21,12 @@ import provenance
 import torch
 from torch import Tensor
 
-from nocl import store
 from nocl.comparisons.reproduce import sysid
 from nocl.data import Dataset
 from nocl.nets import MLP
-from nocl.sysid import LearnedDynamics, Settings, identify
-from nocl.sysid_loss import Loss
+from nocl.support import store
+from nocl.sysid.identification import LearnedDynamics, Settings, identify
+from nocl.sysid.loss import Loss
 from nocl.systems import load_ocp
 
 BATCH, WIDTH, ROWS = 1024, 64, 100_000
@@ -189,7 +189,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
     import matplotlib
     from matplotlib.figure import Figure
 
-    from nocl.comparisons.style import COLOURS, STYLE, encode
+    from nocl.comparisons.report.style import COLOURS, STYLE, encode
 
     systems = list(dict.fromkeys(r["system"] for r in rows))
     with matplotlib.rc_context(STYLE):

@@ -1,8 +1,10 @@
 """Comparisons of any methods, per initial state."""
 
-from nocl.comparisons.compare import compare
-from nocl.comparisons.report import Report
-from nocl.comparisons.robustness import robustness
-from nocl.comparisons.study import study
+from __future__ import annotations
 
-__all__ = ["Report", "compare", "robustness", "study"]
+from nocl.support.lazy import hand_on
+
+_LAZY = {"compare": "nocl.comparisons.comparison", "Report": "nocl.comparisons.report.results",
+         "robustness": "nocl.comparisons.disturbances", "study": "nocl.comparisons.studies"}
+__all__ = list(_LAZY)
+__getattr__, __dir__ = hand_on(__name__, _LAZY)

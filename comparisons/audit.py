@@ -14,13 +14,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from nocl.checks import Array
-from nocl.comparisons.findings import MethodAudit, Rollouts, ValueAudit
-from nocl.comparisons.report import COST_FLOOR, REFERENCE, Judged, Report
-from nocl.integrate import rk4
+from nocl.comparisons.report.findings import MethodAudit, Rollouts, ValueAudit
+from nocl.comparisons.report.results import COST_FLOOR, REFERENCE, Judged, Report
+from nocl.judge import AT_BOUND, dynamics_function, policy_function
 from nocl.ocp import OCP
-from nocl.simulate import AT_BOUND, dynamics_function, policy_function
-from nocl.solvers.loop import Loop
+from nocl.solvers.nmpc.loop import Loop
+from nocl.support.checks import Array
+from nocl.translate.rk4 import rk4
 
 EXACT, LEARNED = "exact f, RK4", "learned model, RK4"
 SUBSTEPS = 4  # RK4 steps between two nodes of continuous feedback: its gain grows towards the end
@@ -35,7 +35,7 @@ def audit(report: Report, methods: Mapping[str, Any], model: Any = None) -> tupl
     `to_casadi()`; without one the rollouts on it are missing. Where it has `doubt(x, u)` (learned dynamics, ensembles),
     what it says of the judged runs stands beside.
     """
-    from nocl.threads import one_thread  # with torch
+    from nocl.support.threads import one_thread  # with torch
 
     learned = None if model is None else dynamics_function(report.ocp, model)
     with one_thread():

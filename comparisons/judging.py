@@ -15,13 +15,13 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from nocl.checks import Array
 from nocl.comparisons.methods import STAGES, Run, said
+from nocl.judge import Simulation, simulate
 from nocl.ocp import OCP
-from nocl.simulate import Simulation, simulate
-from nocl.solvers.compiled import fingerprint
-from nocl.solvers.loop import Loop
-from nocl.solvers.pool import Journal, Pool, do
+from nocl.solvers.nmpc.loop import Loop
+from nocl.support.checks import Array
+from nocl.support.compiler import fingerprint
+from nocl.support.pool import Journal, Pool, do
 
 CALLS = 20  # control evaluations that are timed at each initial state, at most; the median counts
 TIMED = 100.0  # milliseconds spent on that, about

@@ -19,12 +19,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from nocl.checks import Array
-from nocl.comparisons.report import OPEN_LOOP, Plan, count
+from nocl.comparisons.report.results import OPEN_LOOP, Plan, count
 from nocl.data import Solution
+from nocl.judge import policy_function
 from nocl.ocp import OCP
-from nocl.simulate import policy_function
-from nocl.solvers.loop import Loop
+from nocl.solvers.nmpc.loop import Loop
+from nocl.support.checks import Array
 
 SAMPLED = 80  # intervals that a plain callable is held on
 STAGES = 4  # evaluations of f in an RK4 step
@@ -222,7 +222,7 @@ def _wall_time(measured: float, kept: Path | None, begun: bool) -> float:
     """Seconds that all solves took; of a run that was resumed those of the first one, NaN where it was cut off."""
     if kept is None:
         return measured
-    from nocl import store  # with torch
+    from nocl.support import store  # with torch
 
     file = kept.with_name(f"{kept.name}.seconds")
     if begun:

@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from nocl.checks import Array
-from nocl.comparisons import report
+from nocl.comparisons.report import results
 from nocl.ocp import OCP
-from nocl.solvers.bank import better
-from nocl.solvers.ddp import DDP, DDPSolution
+from nocl.solvers.ddp.bank import better
+from nocl.solvers.ddp.solver import DDP, DDPSolution
+from nocl.support.checks import Array
 
-NAME = report.REFERENCE
+NAME = results.REFERENCE
 SLOTS = 40  # kicks fall on multiples of the horizon over SLOTS
 
 

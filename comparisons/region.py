@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from nocl.checks import Array
-from nocl.comparisons.findings import Region
 from nocl.comparisons.promise import interval
 from nocl.comparisons.reference import Reference
-from nocl.comparisons.report import COST_FLOOR, VIOLATION
+from nocl.comparisons.report.findings import Region
+from nocl.comparisons.report.results import COST_FLOOR, VIOLATION
+from nocl.judge import simulate
 from nocl.ocp import OCP
 from nocl.sampling import Distribution, Gaussian, Uniform
-from nocl.simulate import simulate
-from nocl.solvers.ddp import DDP
-from nocl.solvers.global_search import solve_globally
+from nocl.solvers.ddp.global_search import solve_globally
+from nocl.solvers.ddp.solver import DDP
+from nocl.support.checks import Array
 
 SCALES = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0)
 HELD = 80  # intervals of the optimum that successes are measured by

@@ -16,14 +16,14 @@ import casadi as ca
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from nocl.checks import Array
-from nocl.comparisons.findings import Stability
-from nocl.comparisons.report import REFERENCE, Report
-from nocl.integrate import rk4
+from nocl.comparisons.report.findings import Stability
+from nocl.comparisons.report.results import REFERENCE, Report
+from nocl.judge import policy_function
 from nocl.ocp import OCP
-from nocl.simulate import policy_function
-from nocl.solvers.ddp import DDP
+from nocl.solvers.ddp.solver import DDP
 from nocl.solvers.lqr import LQR
+from nocl.support.checks import Array
+from nocl.translate.rk4 import rk4
 
 LATE, MIDDLE = 0.99, 0.5  # of the horizon
 POINTS = 8  # best known trajectories that mid-horizon is looked at on

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from nocl.ocp import OCP
@@ -13,45 +11,39 @@ from nocl.system import System
 
 if TYPE_CHECKING:
     from nocl.data import Dataset, Solution, Trajectory
-    from nocl.ensemble import Ensemble
-    from nocl.logs import Log
-    from nocl.simulate import simulate
-    from nocl.solvers.cnd import CND, pretrained, train
-    from nocl.sysid import LearnedDynamics, identify
+    from nocl.exports.casadi_forms import to_casadi
+    from nocl.judge import simulate
+    from nocl.solvers.cnd.controller import CND, pretrained
+    from nocl.solvers.cnd.training import train
+    from nocl.sysid.ensemble import Ensemble
+    from nocl.sysid.identification import LearnedDynamics, identify
+    from nocl.sysid.logs.log import Log
     from nocl.systems import load_ocp
-    from nocl.to_casadi import to_casadi
-    from nocl.to_torch import to_torch
+    from nocl.translate.torch_functions import to_torch
 
 __version__ = "0.1.0"
 __all__ = ["CND", "OCP", "Dataset", "Ensemble", "Gaussian", "LearnedDynamics", "Log", "Solution", "System",
            "Trajectory", "Uniform", "identify", "load_ocp", "pretrained", "simulate", "to_casadi", "to_torch", "train"]
 
 _LAZY = {  # public name -> module: torch and the solvers are imported when first used
-    "CND": "nocl.solvers.cnd", "train": "nocl.solvers.cnd", "pretrained": "nocl.solvers.cnd",
-    "identify": "nocl.sysid", "LearnedDynamics": "nocl.sysid",
-    "Ensemble": "nocl.ensemble", "Log": "nocl.logs",
+    "CND": "nocl.solvers.cnd.controller", "train": "nocl.solvers.cnd.training",
+    "pretrained": "nocl.solvers.cnd.controller",
+    "identify": "nocl.sysid.identification", "LearnedDynamics": "nocl.sysid.identification",
+    "Ensemble": "nocl.sysid.ensemble", "Log": "nocl.sysid.logs.log",
     "Dataset": "nocl.data", "Solution": "nocl.data", "Trajectory": "nocl.data",
-    "load_ocp": "nocl.systems", "simulate": "nocl.simulate",
-    "to_torch": "nocl.to_torch", "to_casadi": "nocl.to_casadi",
+    "load_ocp": "nocl.systems", "simulate": "nocl.judge",
+    "to_torch": "nocl.translate.torch_functions", "to_casadi": "nocl.exports.casadi_forms",
 }
-
-
-class _Package(ModuleType):
-    """nocl.to_torch and its like are the functions, whether or not the modules of the same name are imported."""
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        if not (name in _LAZY and isinstance(value, ModuleType)):
-            super().__setattr__(name, value)
-
-
-sys.modules[__name__].__class__ = _Package
+_PACKAGES = ("comparisons", "exports", "solvers", "support", "sysid", "systems", "translate")  # nocl.solvers.NMPC(...)
 
 
 def __getattr__(name: str) -> Any:
+    if name in _PACKAGES:
+        return import_module(f"nocl.{name}")
     if name not in _LAZY:
         raise AttributeError(f"module 'nocl' has no attribute {name!r}")
     return getattr(import_module(_LAZY[name]), name)
 
 
 def __dir__() -> list[str]:
-    return sorted(__all__)
+    return sorted([*__all__, *_PACKAGES])

@@ -4,6 +4,6 @@ from __future__ import annotations
 
 import sys
 
-from nocl.cli import main
+from nocl.cli.commands import main
 
 sys.exit(main())

@@ -9,8 +9,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nocl.checks import Array
 from nocl.sampling import Seed
+from nocl.support.checks import Array
 from nocl.system import System
 
 

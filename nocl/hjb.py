@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nocl.integrate import rk4, rk4_cost
+from nocl.translate.rk4 import rk4, rk4_cost
 
 Map = Callable[..., Tensor]  # of one or two tensors of rows
 Step = Callable[..., tuple[Any, Any]]  # (f, L, x, u, h) -> (x after h with u held, integral of L)

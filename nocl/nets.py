@@ -9,7 +9,7 @@ import casadi as ca
 import torch
 from torch import Tensor, nn
 
-from nocl.to_torch import to_torch
+from nocl.translate.torch_functions import to_torch
 
 
 class Sine(nn.Module):

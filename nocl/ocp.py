@@ -11,10 +11,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from nocl import checks, pretty, sampling, symbolic
-from nocl.checks import Array, Vector
+from nocl import pretty, sampling
 from nocl.sampling import Distribution, Gaussian, Uniform, short
+from nocl.support import checks
+from nocl.support.checks import Array, Vector
 from nocl.system import System
+from nocl.translate import instructions
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -178,7 +180,7 @@ class OCP:
         """The problem with its system as plain JSON data, exact to the last bit."""
         return {"system": self.system.to_data(), "horizon": self.horizon, "x_goal": self.x_goal.tolist(),
                 "u_goal": self.u_goal.tolist(), "initial_states": sampling.to_data(self.initial_states),
-                "L": symbolic.to_data(self.L), "G": symbolic.to_data(self.G), "h": symbolic.to_data(self.h),
+                "L": instructions.to_data(self.L), "G": instructions.to_data(self.G), "h": instructions.to_data(self.h),
                 "path_constraints": list(self.path_constraints),
                 "penalty": self.penalty, "penalty_margin": self.penalty_margin}
 
@@ -188,10 +190,10 @@ class OCP:
         try:
             system = System.from_data(data["system"])
             x, u = system.x, system.u
-            constraints = ca.vertsplit(symbolic.from_data(data["h"], [x])(x)) if data["path_constraints"] else []
+            constraints = ca.vertsplit(instructions.from_data(data["h"], [x])(x)) if data["path_constraints"] else []
             return OCP(system, horizon=data["horizon"], x_goal=data["x_goal"], u_goal=data["u_goal"],
-                       running=symbolic.from_data(data["L"], [x, u])(x, u),
-                       terminal=symbolic.from_data(data["G"], [x])(x),
+                       running=instructions.from_data(data["L"], [x, u])(x, u),
+                       terminal=instructions.from_data(data["G"], [x])(x),
                        initial_states=sampling.from_data(data["initial_states"]),
                        path_constraints=dict(zip(data["path_constraints"], constraints, strict=True)),
                        penalty=data["penalty"], penalty_margin=data["penalty_margin"])
@@ -199,8 +201,8 @@ class OCP:
             raise ValueError(f"not an OCP written by nocl: {type(error).__name__}: {error}") from error
 
     def to_gymnasium(self, *, steps: int = 80, integrator: str = "rk4", observe_time: bool = True) -> Any:
-        """A gymnasium.Env whose return is minus this problem's cost: see nocl.interop.to_gymnasium."""
-        from nocl.interop import to_gymnasium
+        """A gymnasium.Env whose return is minus this problem's cost: see nocl.exports.interop.to_gymnasium."""
+        from nocl.exports.interop import to_gymnasium
 
         return to_gymnasium(self, steps=steps, integrator=integrator, observe_time=observe_time)
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import casadi as ca
 
-from nocl.symbolic import Instruction, instructions
+from nocl.translate.instructions import Instruction, instructions
 
 SHARED = 16  # characters from which a subexpression used several times gets a name of its own
 _ATOM, _POWER, _PRODUCT, _QUOTIENT, _SUM, _COMPARISON, _LOGIC = range(7)  # how loosely a text binds

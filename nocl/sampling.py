@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from nocl.checks import Array, Vector, vector
+from nocl.support.checks import Array, Vector, vector
 
 Seed = int | np.random.Generator
 

@@ -13,8 +13,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nocl import checks, pretty, symbolic
-from nocl.checks import Array, Vector
+from nocl import pretty
+from nocl.support import checks
+from nocl.support.checks import Array, Vector
+from nocl.translate import instructions
 
 N_PROBES = 512  # points of the box at which the equations are tried on construction
 
@@ -182,7 +184,7 @@ class System:
     def to_data(self) -> dict[str, Any]:
         """The system as plain JSON data, exact to the last bit."""
         return {"name": self.name, "x": list(self.state_names), "u": list(self.control_names),
-                "f": None if self.xdot is None else symbolic.to_data(self.f),
+                "f": None if self.xdot is None else instructions.to_data(self.f),
                 "angles": list(self.angles), "units": dict(self.units),
                 **{name: getattr(self, name).tolist() for name in ("lbu", "ubu", "lbx", "ubx")}}
 
@@ -191,7 +193,7 @@ class System:
         """The system that to_data wrote, with new symbols; ValueError for anything else."""
         try:
             x, u = (ca.vertcat(*map(ca.SX.sym, data[names])) for names in ("x", "u"))
-            xdot = None if data["f"] is None else symbolic.from_data(data["f"], [x, u])(x, u)
+            xdot = None if data["f"] is None else instructions.from_data(data["f"], [x, u])(x, u)
             return System(data["name"], x=x, u=u, xdot=xdot, angles=data["angles"], units=data["units"],
                           **{name: data[name] for name in ("lbu", "ubu", "lbx", "ubx")})
         except (KeyError, TypeError, AttributeError, NotImplementedError, RuntimeError) as error:
@@ -200,13 +202,13 @@ class System:
     @staticmethod
     def from_casadi(f: ca.Function, *, lbu: Vector, ubu: Vector, lbx: Vector, ubx: Vector, **options: Any) -> System:
         """The system of f:(x [nx], u [nu]) -> xdot [nx]; options: name, states, controls (names), angles, units."""
-        from nocl.interop import system_from_casadi
+        from nocl.exports.interop import system_from_casadi
 
         return system_from_casadi(f, lbu=lbu, ubu=ubu, lbx=lbx, ubx=ubx, **options)
 
     def to_control(self, x: ArrayLike | None = None, u: ArrayLike | None = None) -> Any:
         """python-control's NonlinearIOSystem; with (x, u) the StateSpace of the linearisation there."""
-        from nocl import interop
+        from nocl.exports import interop
 
         if (x is None) != (u is None):
             raise ValueError(f"{self.name}.to_control: got one of x and u; expected both, or neither")
@@ -214,13 +216,13 @@ class System:
 
     def to_do_mpc(self) -> Any:
         """do-mpc's continuous Model of the system, set up."""
-        from nocl.interop import to_do_mpc
+        from nocl.exports.interop import to_do_mpc
 
         return to_do_mpc(self)
 
     def to_acados(self) -> Any:
         """acados' AcadosModel of the same equations (needs acados_template)."""
-        from nocl.interop import to_acados
+        from nocl.exports.interop import to_acados
 
         return to_acados(self)
 

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import Any
+from nocl.support.lazy import hand_on
 
-_LAZY = {"LQR": "nocl.solvers.lqr", "NMPC": "nocl.solvers.nmpc", "DDP": "nocl.solvers.ddp", "CND": "nocl.solvers.cnd",
-         "SolutionBank": "nocl.solvers.bank", "solve_globally": "nocl.solvers.global_search",
-         "NeuralOC": "nocl.solvers.neural_oc", "train_neural_oc": "nocl.solvers.neural_oc"}
+_LAZY = {"LQR": "nocl.solvers.lqr", "NMPC": "nocl.solvers.nmpc.solver", "DDP": "nocl.solvers.ddp.solver",
+         "CND": "nocl.solvers.cnd.controller", "SolutionBank": "nocl.solvers.ddp.bank",
+         "solve_globally": "nocl.solvers.ddp.global_search", "NeuralOC": "nocl.solvers.neural_oc",
+         "train_neural_oc": "nocl.solvers.neural_oc"}
 __all__ = list(_LAZY)
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _LAZY:
-        raise AttributeError(f"module 'nocl.solvers' has no attribute {name!r}")
-    return getattr(import_module(_LAZY[name]), name)
+__getattr__, __dir__ = hand_on(__name__, _LAZY)

@@ -17,9 +17,9 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import BSpline, make_interp_spline
 from scipy.linalg import LinAlgError, solve_continuous_are
 
-from nocl import checks
-from nocl.checks import Array
 from nocl.ocp import OCP
+from nocl.support import checks
+from nocl.support.checks import Array
 
 DEGREE = 5  # of the spline through P(t)
 REFINE = 3  # spline nodes for each step of the Riccati integration

@@ -32,14 +32,14 @@ from numpy.typing import ArrayLike
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from nocl import checks, store
-from nocl.checks import Array
-from nocl.fused import FusedFunction
 from nocl.hamiltonian import minimiser
-from nocl.integrate import rk4
 from nocl.ocp import OCP
-from nocl.threads import one_thread
-from nocl.to_torch import to_torch
+from nocl.support import checks, store
+from nocl.support.checks import Array
+from nocl.support.threads import one_thread
+from nocl.translate.fused import FusedFunction
+from nocl.translate.rk4 import rk4
+from nocl.translate.torch_functions import to_torch
 
 __all__ = ["NeuralOC", "NeuralOCSettings", "train_neural_oc"]
 FILE = "neural_oc.safetensors"

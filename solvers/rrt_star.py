@@ -21,10 +21,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from tqdm import tqdm
 
-from nocl import checks
-from nocl.checks import Array
 from nocl.data import Solution, Trajectory
 from nocl.ocp import OCP
+from nocl.support import checks
+from nocl.support.checks import Array
 
 try:
     from ompl import base, geometric, util

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 import nocl
-from nocl.checks import Vector
+from nocl.support.checks import Vector
 
 
 def system(

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 import nocl
-from nocl.checks import Vector
+from nocl.support.checks import Vector
 
 SMOOTHING = 1e-3  # m, keeps the distance differentiable at the obstacle's centre
 

@@ -10,7 +10,7 @@ import casadi as ca
 import numpy as np
 
 import nocl
-from nocl.checks import Vector
+from nocl.support.checks import Vector
 
 STATES = ("px", "py", "pz", "psi", "theta", "phi", "vx", "vy", "vz", "w_psi", "w_theta", "w_phi")
 

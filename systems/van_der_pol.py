@@ -8,7 +8,7 @@ from __future__ import annotations
 import casadi as ca
 
 import nocl
-from nocl.checks import Vector
+from nocl.support.checks import Vector
 
 
 def system(

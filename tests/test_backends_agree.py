@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_to_casadi import feature_net
 
-from nocl import parity
-from nocl.export import _Export
+from nocl.exports import parity
+from nocl.exports.bundle import _Export
+from nocl.exports.casadi_forms import to_casadi
 from nocl.nets import ACTIVATIONS
-from nocl.to_casadi import to_casadi
 
 SHAPES = {"nx": st.integers(1, 12), "nu": st.integers(1, 4), "angles": st.integers(0, 3), "width": st.integers(1, 24),
           "activation": st.sampled_from(sorted(ACTIVATIONS)), "skip": st.booleans(), "seed": st.integers(0, 999)}

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import nocl
-from nocl.solvers.bank import SolutionBank, better, extend
-from nocl.solvers.ddp import DDP, DDPSolution
-from nocl.solvers.global_search import GlobalDDP, GlobalSolution, clean, cold_controls, equilibria, solve_globally
+from nocl.solvers.ddp.bank import SolutionBank, better, extend
+from nocl.solvers.ddp.global_search import GlobalDDP, GlobalSolution, clean, cold_controls, equilibria, solve_globally
+from nocl.solvers.ddp.solver import DDP, DDPSolution
 
 N = 24
 
@@ -298,7 +298,7 @@ def test_a_saved_bank_is_the_same_and_others_are_refused(tmp_path):
     assert [p.name for p in path.parent.iterdir()] == ["bank.safetensors"]
     with pytest.raises(ValueError, match="does not exist"):
         SolutionBank.load(tmp_path)
-    nocl.store.save_checkpoint(tmp_path / "bank.safetensors", {})
+    nocl.support.store.save_checkpoint(tmp_path / "bank.safetensors", {})
     with pytest.raises(ValueError, match="no solution bank"):
         SolutionBank.load(tmp_path)
     content = bytearray(path.read_bytes())

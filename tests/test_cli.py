@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 import nocl
-from nocl import parity, stages
-from nocl.cli import main
+from nocl.cli import run_folder
+from nocl.cli.commands import main
+from nocl.exports import parity
 from nocl.solvers import NMPC
 from nocl.solvers.cnd import CND, TrainSettings
-from nocl.sysid import Settings
+from nocl.sysid.identification import Settings
 
 SYSTEM = """
 import casadi as ca
@@ -150,7 +151,7 @@ def test_an_unexpected_error_is_one_line_too(here, capsys, monkeypatch):
     def fails(*args):
         raise RuntimeError("something\nof CasADi's")
 
-    monkeypatch.setattr(stages, "solve", fails)
+    monkeypatch.setattr(run_folder, "solve", fails)
     assert main(["solve", "cubic.py"]) == 2
     assert capsys.readouterr().err == \
         "nocl: error: unexpected RuntimeError: something of CasADi's (--debug shows where)\n"
@@ -160,7 +161,7 @@ def test_interruption_is_one_line_and_130(here, capsys, monkeypatch):
     def interrupted(*args, **options):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(stages, "identify", interrupted)
+    monkeypatch.setattr(run_folder, "identify", interrupted)
     assert main(["run", "cubic.py"]) == 130
     assert "interrupted" in capsys.readouterr().err
 
@@ -211,7 +212,7 @@ def test_solve_writes_solutions(here, capsys, solver):
 
 def test_an_interrupted_solve_goes_on(here, monkeypatch):
     """DDP's stages and NMPC's states so far are kept until all is solved."""
-    from nocl.solvers.ddp import DDP
+    from nocl.solvers.ddp.solver import DDP
 
     command = ["solve", "cubic.py", "--solver", "ddp", "--n", "4", "--intervals", "9", "--workers", "1", "--out", "new"]
     done, left, descend = [], [5], DDP.descend
@@ -246,8 +247,8 @@ SMALL = TrainSettings(seeds=3, starts=2, states=6, tails=30, visits=20, rounds=0
 
 
 def small(monkeypatch):
-    monkeypatch.setattr(stages, "QUICK_TRAIN", SMALL)
-    monkeypatch.setattr(stages, "QUICK_IDENTIFY", Settings(iterations=20, polish=2, samples=500))
+    monkeypatch.setattr(run_folder, "QUICK_TRAIN", SMALL)
+    monkeypatch.setattr(run_folder, "QUICK_IDENTIFY", Settings(iterations=20, polish=2, samples=500))
 
 
 RUN = ["run", "cubic.py", "--out", "out", "--quick", "--n", "2", "--intervals", "10"]

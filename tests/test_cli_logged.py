@@ -6,11 +6,11 @@ import pytest
 from scipy.linalg import expm
 
 import nocl
-from nocl import stages
-from nocl.cli import main
-from nocl.simulate import simulate
+from nocl.cli import run_folder
+from nocl.cli.commands import main
+from nocl.judge import simulate
 from nocl.solvers.cnd import CND, TrainSettings
-from nocl.sysid import LearnedDynamics, LogSettings
+from nocl.sysid.identification import LearnedDynamics, LogSettings
 
 PLANT = """import casadi as ca
 import nocl
@@ -27,8 +27,8 @@ EXACT = "ca.vertcat(v, -4 * p - 0.4 * v + u)"
 def here(tmp_path, monkeypatch):
     """plant.py without equations, exact.py with them, log.csv: five recordings under random held controls."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(stages, "QUICK_LOG", LogSettings(width=6, iterations=40, steps=4, window=20))
-    monkeypatch.setattr(stages, "QUICK_TRAIN", TrainSettings(
+    monkeypatch.setattr(run_folder, "QUICK_LOG", LogSettings(width=6, iterations=40, steps=4, window=20))
+    monkeypatch.setattr(run_folder, "QUICK_TRAIN", TrainSettings(
         seeds=2, starts=2, states=12, tails=60, visits=40, rounds=1, iterations=80, value_initial=10, value_tails=60,
         value_visits=40, value_iterations=40, held_out=4))
     (tmp_path / "plant.py").write_text(PLANT.format(xdot=None))

@@ -9,7 +9,7 @@ import pytest
 
 import nocl
 from nocl.comparisons import compare
-from nocl.comparisons.report import percentile
+from nocl.comparisons.report.results import percentile
 from nocl.data import Solution, Trajectory
 from nocl.solvers import DDP, LQR, NMPC
 from nocl.systems import double_integrator, dubins
@@ -233,7 +233,7 @@ def test_each_controller_is_run_at_the_rates_that_are_named(ocp):
 
 def test_an_imported_onnx_policy_is_a_method(ocp, tmp_path):
     onnx = pytest.importorskip("onnx")
-    from nocl.from_onnx import from_onnx
+    from nocl.exports.onnx_reader import from_onnx
 
     W = onnx.numpy_helper.from_array(np.array([[-1.0], [-2.0]]), "W")
     obs, u = (onnx.helper.make_tensor_value_info(name, onnx.TensorProto.DOUBLE, [1, n]) for name, n in (("obs", 2),

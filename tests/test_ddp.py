@@ -9,11 +9,11 @@ import pytest
 import torch
 
 import nocl
-from nocl.integrate import rk4_cost
 from nocl.nets import MLP, FeatureNet
 from nocl.solvers import NMPC
-from nocl.solvers.ddp import DDP, DDPSettings, DDPSolution, _Work
-from nocl.sysid import LearnedDynamics
+from nocl.solvers.ddp.solver import DDP, DDPSettings, DDPSolution, _Work
+from nocl.sysid.identification import LearnedDynamics
+from nocl.translate.rk4 import rk4_cost
 
 BUNDLED = ("cartpole", "acrobot", "quadrotor", "dubins", "pendulum", "van_der_pol")
 problem = lru_cache(nocl.load_ocp)

@@ -11,8 +11,9 @@ from test_ddp import BUNDLED, problem, random_model, scalar_problem, solver
 from test_nmpc_pool import dask_cluster
 
 import nocl
-from nocl.solvers import NMPC, ddp_batch
-from nocl.solvers.ddp import DDP
+from nocl.solvers import NMPC
+from nocl.solvers.ddp import batch
+from nocl.solvers.ddp.solver import DDP
 
 
 def assert_same(a, b):
@@ -34,26 +35,26 @@ def test_pieces_give_what_one_go_does(monkeypatch):
     t0, guess = np.linspace(0, 1, 30), ddp.solve(x0)
     options = {"u": guess.u, "x": guess.x, "gain": guess.gain, "curvature": True}
     whole = ddp.solve(x0, t0, **options)
-    monkeypatch.setattr(ddp_batch, "MOST", 7)
+    monkeypatch.setattr(batch, "MOST", 7)
     assert_same(whole, ddp.solve(x0, t0, **options))
     assert_same(whole, ddp.solve(x0, t0, **options, workers=2))
 
 
 def test_pieces_are_as_large_as_the_memory_allows(monkeypatch):
     def largest(ddp, x0, curvature=False):
-        parts = ddp_batch.pieces(ddp, x0, np.zeros(len(x0)), {}, curvature)
+        parts = batch.pieces(ddp, x0, np.zeros(len(x0)), {}, curvature)
         assert sum(p.size for p in parts) == len(x0)
         return max(p.size for p in parts)
 
     short, long = solver("double_integrator"), solver("double_integrator", 10_000)
     x0 = np.zeros((5000, 2))
-    assert largest(short, x0) == ddp_batch.MOST
+    assert largest(short, x0) == batch.MOST
     assert 1 < largest(long, x0) < 500
-    assert largest(long, x0) * ddp_batch.bytes_each(long, False) <= ddp_batch.BYTES
+    assert largest(long, x0) * batch.bytes_each(long, False) <= batch.BYTES
     assert largest(long, x0, True) < largest(long, x0)
-    monkeypatch.setattr(ddp_batch, "BYTES", 1)
+    monkeypatch.setattr(batch, "BYTES", 1)
     assert largest(long, x0[:3]) == 1
-    assert len(ddp_batch.pieces(short, x0[:0], np.zeros(0), {}, False)) == 1  # an empty batch has an empty answer
+    assert len(batch.pieces(short, x0[:0], np.zeros(0), {}, False)) == 1  # an empty batch has an empty answer
 
 
 def test_a_solver_pickles_with_and_without_learned_dynamics():
@@ -67,7 +68,7 @@ def test_a_solver_pickles_with_and_without_learned_dynamics():
 def test_an_interrupted_run_resumes(tmp_path, monkeypatch):
     ddp, x0 = pendulum()
     whole, done, descend = ddp.solve(x0, curvature=True), [], DDP.descend
-    monkeypatch.setattr(ddp_batch, "MOST", 8)
+    monkeypatch.setattr(batch, "MOST", 8)
 
     def interrupted(self, batch):
         if len(done) == 2:
@@ -101,7 +102,7 @@ def test_bad_workers(workers):
 @pytest.mark.slow
 def test_a_dask_cluster_gives_the_same(tmp_path, monkeypatch):
     ddp, x0 = pendulum()
-    monkeypatch.setattr(ddp_batch, "MOST", 8)
+    monkeypatch.setattr(batch, "MOST", 8)
     with dask_cluster(tmp_path) as (address, _):
         solution = ddp.solve(x0, workers=address, out=tmp_path / "run")
     assert_same(solution, ddp.solve(x0))
@@ -176,7 +177,7 @@ def test_non_convex_costs_find_a_minimum_or_say_that_there_is_none():
 
 def cost_of(ocp, x, u):
     """The common RK4's cost [B] of controls u [B, K, 1] along x [B, K+1, 1]."""
-    from nocl.integrate import rk4_cost
+    from nocl.translate.rk4 import rk4_cost
 
     z, v = ca.SX.sym("z"), ca.SX.sym("v")
     step = ca.Function("step", [z, v], list(rk4_cost(ocp.system.f, ocp.L_soft, z, v, ocp.horizon / u.shape[1])))

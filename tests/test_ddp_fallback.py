@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import nocl
-from nocl.solvers import ddp_numpy
-from nocl.solvers.ddp import DDP
-from nocl.solvers.ddp_numpy import NumpyKernel
+from nocl.solvers.ddp import without_compiler
+from nocl.solvers.ddp.solver import DDP
+from nocl.solvers.ddp.without_compiler import NumpyKernel
 from tests.test_ddp import random_model
 
 FIELDS = ("cost", "x", "u", "gain", "V", "V_x", "V_xx", "success", "message", "iterations")
@@ -37,7 +37,7 @@ def test_numbers_are_the_compiled_ones(name, learned):
 @pytest.mark.parametrize("name", ["acrobot", "dubins", "quadrotor"])
 @pytest.mark.parametrize("mu", [0.0, 3.0])
 def test_one_sweep_and_one_rollout_equal_the_compiled_ones(name, mu):
-    from nocl.solvers.ddp import _Work
+    from nocl.solvers.ddp.solver import _Work
 
     ocp, K, B = nocl.load_ocp(name), 10, 5
     s, rng = ocp.system, np.random.default_rng(4)
@@ -64,7 +64,7 @@ def test_one_sweep_and_one_rollout_equal_the_compiled_ones(name, mu):
 
 def test_it_is_chosen_by_itself_and_said_once(monkeypatch):
     monkeypatch.setenv("CC", "no-such-cc")
-    ddp_numpy._say_once.cache_clear()
+    without_compiler._say_once.cache_clear()
     ocp = nocl.load_ocp("pendulum")
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")

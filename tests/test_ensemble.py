@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import nocl
-from nocl.ensemble import Ensemble
-from nocl.sysid import Settings
+from nocl.sysid.ensemble import Ensemble
+from nocl.sysid.identification import Settings
 from nocl.systems import dubins, pendulum, van_der_pol
 
 SMALL = Settings(iterations=150, polish=15, polish_batch=512, width=12)

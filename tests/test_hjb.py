@@ -8,10 +8,10 @@ import torch
 from scipy.integrate import solve_ivp
 
 from nocl import hjb
-from nocl.integrate import rk4_cost
 from nocl.nets import MLP
 from nocl.systems import cartpole, double_integrator
-from nocl.to_torch import to_torch
+from nocl.translate.rk4 import rk4_cost
+from nocl.translate.torch_functions import to_torch
 
 T = 2.0
 A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import nocl
-from nocl.integrate import rk4_cost
+from nocl.translate.rk4 import rk4_cost
 
 
 @pytest.fixture(scope="module")

@@ -7,9 +7,9 @@ import threading
 import numpy as np
 import pytest
 
-from nocl.interrupt import deferred
-from nocl.simulate import simulate
+from nocl.judge import simulate
 from nocl.solvers import NMPC
+from nocl.support.interrupt import deferred
 from nocl.systems import cartpole
 
 
@@ -64,7 +64,7 @@ def test_other_threads_are_left_alone():
 
 def pressed_by_the_solver(monkeypatch):
     """Ctrl-C comes the moment that a solver is called."""
-    from nocl import interrupt
+    from nocl.support import interrupt
 
     original = interrupt.deferred
 

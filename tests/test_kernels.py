@@ -8,9 +8,9 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from nocl import kernels
-from nocl.kernels import Kernel, emit
-from nocl.symbolic import instructions
+from nocl.translate import kernels
+from nocl.translate.instructions import instructions
+from nocl.translate.kernels import Kernel, emit
 
 LOOP = """
 void run(int64_t first, int64_t last, const int64_t *index, const double *x_, double *y_)
@@ -141,7 +141,7 @@ def test_one_source_is_one_file_in_the_named_folder(tmp_path, monkeypatch):
 
 def test_two_processes_may_build_at_once(tmp_path):
     (tmp_path / "source.c").write_text(source([ca.sin(A) + B]))
-    script = ("import sys, numpy as np\nfrom pathlib import Path\nfrom nocl.kernels import Kernel\n"
+    script = ("import sys, numpy as np\nfrom pathlib import Path\nfrom nocl.translate.kernels import Kernel\n"
               "k = Kernel(Path(sys.argv[1]).read_text(), sys.argv[2])\n"
               "y = np.zeros((1, 1)); k('run', np.arange(1), np.array([[0.0, 7.0]]), y); print(y[0, 0])")
     command = [sys.executable, "-c", script, str(tmp_path / "source.c"), str(tmp_path / "cache")]
@@ -152,7 +152,7 @@ def test_two_processes_may_build_at_once(tmp_path):
 
 
 def test_without_a_cache_nothing_stays(tmp_path):
-    script = ("from tests.test_kernels import *\nfrom nocl.kernels import _own_folder\n"
+    script = ("from tests.test_kernels import *\nfrom nocl.translate.kernels import _own_folder\n"
               "Kernel(source([A])); print(_own_folder().name)")
     root = Path(__file__).resolve().parents[1]
     out = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=root)
@@ -189,14 +189,14 @@ def test_sines_are_accurate_wherever_they_are_asked():
 @pytest.mark.parametrize("name", ["cartpole", "quadrotor"])
 def test_looped_chain_rule_equals_the_straight_one(name, tmp_path, monkeypatch):
     import nocl
-    from nocl.solvers import ddp_kernel
-    from nocl.solvers.ddp import DDP
+    from nocl.solvers.ddp import kernel
+    from nocl.solvers.ddp.solver import DDP
 
     ocp = nocl.load_ocp(name)
     x0, answers = ocp.initial_states.sample(3, 0), []
     for limit in (10**9, 0):
-        monkeypatch.setattr(ddp_kernel, "STRAIGHT", limit)
-        assert ("chain.h" in ddp_kernel.ddp_source(ocp)) == (limit == 0)
+        monkeypatch.setattr(kernel, "STRAIGHT", limit)
+        assert ("chain.h" in kernel.ddp_source(ocp)) == (limit == 0)
         answers.append(DDP(ocp, intervals=20, threads=1, cache=tmp_path).solve(x0, curvature=True))
     for field in ("cost", "u", "gain", "V_x", "V_xx"):
         a, b = (getattr(s, field) for s in answers)

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import nocl
-from nocl.simulate import simulate
+from nocl.judge import simulate
 from nocl.solvers.lqr import LQR
 
 pytest.importorskip("hj_reachability")
 
-from nocl.solvers import levelset, levelset_scheme
-from nocl.solvers.levelset import LevelSet, LevelSetSolution, refine
+from nocl.solvers.levelset import scheme, solver
+from nocl.solvers.levelset.solver import LevelSet, LevelSetSolution, refine
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +73,7 @@ def test_refinement_converges_to_the_riccati_value():
 
 def test_richardson_is_exact_for_pure_powers():
     h, limit = np.array([1.0, 0.5, 0.25]), np.array([1.0, -2.0])
-    study = levelset.Refinement(h, limit + 0.3 * h[:, None] ** 2, np.zeros(3))
+    study = solver.Refinement(h, limit + 0.3 * h[:, None] ** 2, np.zeros(3))
     assert study.order == pytest.approx(2.0, abs=1e-6)
     np.testing.assert_allclose(study.limit, limit, atol=1e-9)
 
@@ -124,7 +124,7 @@ def test_a_cost_that_is_not_quadratic_is_sampled():
 
 def test_stretched_axes_are_finest_at_the_goal_which_is_a_node():
     for lower, upper, goal in ((-4.0, 0.5, 0.0), (-1.0, 3.0, 1.0), (0.0, 2.0, 0.0), (-2.0, 1.0, 1.0)):
-        axis = levelset_scheme.axis(lower, upper, 31, goal, 0.3, False)
+        axis = scheme.axis(lower, upper, 31, goal, 0.3, False)
         cells = np.diff(axis.nodes)
         assert len(axis.nodes) == 31
         assert np.abs(axis.nodes - goal).min() < 1e-12
@@ -138,9 +138,9 @@ def test_stretched_axes_are_finest_at_the_goal_which_is_a_node():
 def test_the_upwind_hamiltonian_is_the_minimum_over_controls_each_with_its_own_side():
     """By brute force over controls, at random states and differences; with equal sides it is the Hamiltonian itself."""
     ocp = nocl.load_ocp("dubins")
-    axes = tuple(levelset_scheme.axis(-4.0, 4.0, 21, 0.0, w, False) for w in (np.inf, 0.5, 1.0))
-    with levelset.jax.enable_x64(True):
-        dynamics = levelset_scheme.Dynamics(ocp, levelset_scheme.exact_minimiser(ocp), axes, 9)
+    axes = tuple(scheme.axis(-4.0, 4.0, 21, 0.0, w, False) for w in (np.inf, 0.5, 1.0))
+    with solver.jax.enable_x64(True):
+        dynamics = scheme.Dynamics(ocp, scheme.exact_minimiser(ocp), axes, 9)
         assert dynamics.undecided == [2]  # v >= 0: where px and py go is known from psi
         rng = np.random.default_rng(0)
         x, left, right = rng.uniform(-3, 3, (300, 3)), rng.normal(0, 0.1, (300, 3)), rng.normal(0, 0.1, (300, 3))
@@ -158,9 +158,9 @@ def test_the_upwind_hamiltonian_is_the_minimum_over_controls_each_with_its_own_s
 def test_the_upwind_hamiltonian_holds_a_drifting_state_still_in_a_fold_of_v():
     """By brute force again: gravity drives omega, so the best control in a fold is neither side's nor that of 0."""
     ocp = nocl.load_ocp("pendulum")
-    axes = tuple(levelset_scheme.axis(-4.0, 4.0, 21, 0.0, np.inf, False) for _ in range(2))
-    with levelset.jax.enable_x64(True):
-        dynamics = levelset_scheme.Dynamics(ocp, levelset_scheme.exact_minimiser(ocp), axes, 9)
+    axes = tuple(scheme.axis(-4.0, 4.0, 21, 0.0, np.inf, False) for _ in range(2))
+    with solver.jax.enable_x64(True):
+        dynamics = scheme.Dynamics(ocp, scheme.exact_minimiser(ocp), axes, 9)
         assert dynamics.undecided == [1]
         rng = np.random.default_rng(0)
         x, left, right = rng.uniform(-3, 3, (300, 2)), rng.normal(0, 0.1, (300, 2)), rng.normal(0, 0.1, (300, 2))
@@ -173,7 +173,7 @@ def test_the_upwind_hamiltonian_holds_a_drifting_state_still_in_a_fold_of_v():
 
 def test_stretching_helps_where_the_goal_is_small():
     """van der Pol's V against the optimum of DDP: 4 % off where it is 8 % on uniform axes."""
-    from nocl.solvers.ddp import DDP
+    from nocl.solvers.ddp.solver import DDP
 
     ocp = nocl.load_ocp("van_der_pol")
     x = ocp.initial_states.sample(20, 3)
@@ -187,7 +187,7 @@ def test_stretching_helps_where_the_goal_is_small():
 
 def test_eased_penalties_are_never_dearer_and_the_same_near_the_edge():
     ocp = nocl.load_ocp("dubins")
-    eased, x = levelset_scheme.eased(ocp, 0.3), np.zeros((400, 3))  # bent at a depth of 0.3 / 600 m
+    eased, x = scheme.eased(ocp, 0.3), np.zeros((400, 3))  # bent at a depth of 0.3 / 600 m
     x[:, 0], x[:, 1] = -1.0, np.linspace(0.0, 0.6, 400)
     soft, less = (np.asarray(o.L_soft(x.T, np.zeros(2))).ravel() for o in (ocp, eased))
     depth = np.maximum(ocp.penalty_margin - np.asarray(ocp.h(x.T)).ravel(), 0)

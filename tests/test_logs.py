@@ -9,14 +9,14 @@ import torch
 from scipy.linalg import expm
 
 import nocl
-from nocl.cli import main
-from nocl.coverage import Coverage
-from nocl.logs import Log
-from nocl.smoothing import dataset, noise
-from nocl.solvers.ddp import DDP
-from nocl.sysid import LearnedDynamics, LogSettings, identify
+from nocl.cli.commands import main
+from nocl.solvers.ddp.solver import DDP
+from nocl.sysid.identification import LearnedDynamics, LogSettings, identify
+from nocl.sysid.logs.coverage import Coverage
+from nocl.sysid.logs.log import Log
+from nocl.sysid.logs.smoothing import dataset, noise
+from nocl.sysid.logs.validation import validate
 from nocl.systems import cartpole, pendulum
-from nocl.validation import validate
 
 FAST = LogSettings(width=6, iterations=30, steps=4, window=20)
 

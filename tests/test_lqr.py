@@ -6,7 +6,7 @@ import pytest
 from scipy.linalg import expm
 
 import nocl
-from nocl.simulate import simulate
+from nocl.judge import simulate
 from nocl.solvers.lqr import LQR
 
 

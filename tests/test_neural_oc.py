@@ -9,9 +9,8 @@ import pytest
 import torch
 
 import nocl
-from nocl.fused import FusedFunction
 from nocl.hjb import value_gradients
-from nocl.simulate import simulate
+from nocl.judge import simulate
 from nocl.solvers import LQR
 from nocl.solvers.neural_oc import (
     NeuralOC,
@@ -23,7 +22,8 @@ from nocl.solvers.neural_oc import (
     train_neural_oc,
 )
 from nocl.systems import double_integrator, quadrotor
-from nocl.to_torch import to_torch
+from nocl.translate.fused import FusedFunction
+from nocl.translate.torch_functions import to_torch
 
 QUICK = {"width": 8, "steps": 10, "batch": 16, "iterations": 4, "check_every": 2, "drop_every": 3, "resample_every": 2}
 
@@ -252,7 +252,7 @@ def test_save_and_load(trained, tmp_path):
     np.testing.assert_array_equal(trained(x, 1.0), again(x, 1.0))
     assert again.card == trained.card
     assert [p.name for p in path.parent.iterdir()] == ["neural_oc.safetensors"]
-    nocl.store.save_checkpoint(path, {"a": torch.zeros(1)})
+    nocl.support.store.save_checkpoint(path, {"a": torch.zeros(1)})
     with pytest.raises(ValueError, match=r"was not written by NeuralOC\.save"):
         NeuralOC.load(tmp_path / "new")
 
@@ -264,7 +264,7 @@ def test_a_save_that_is_interrupted_leaves_the_former_file(trained, tmp_path, mo
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("nocl.store.os.replace", interrupt)
+    monkeypatch.setattr("nocl.support.store.os.replace", interrupt)
     with pytest.raises(KeyboardInterrupt):
         NeuralOC(trained.ocp, copy.deepcopy(trained.value_net), {"other": 1}).save(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == [path.name]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import nocl
-from nocl.simulate import simulate
+from nocl.judge import simulate
 from nocl.solvers import NMPC
 
 BOX = [2.0, 3.0, np.pi, 5.0]  # cart-pole states from which one start often misses

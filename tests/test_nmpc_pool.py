@@ -13,8 +13,8 @@ import pytest
 
 import nocl
 from nocl.solvers import NMPC
-from nocl.solvers import pool as pools
-from nocl.solvers.pool import Journal, Pool
+from nocl.support import pool as pools
+from nocl.support.pool import Journal, Pool
 
 FIELDS = ("cost", "x", "u", "costate", "starts", "hits", "iterations", "success")
 

@@ -6,7 +6,7 @@ import pytest
 from test_nmpc import rk4_lq, walled
 
 import nocl
-from nocl.simulate import simulate
+from nocl.judge import simulate
 from nocl.solvers import NMPC
 
 
@@ -52,7 +52,7 @@ def test_a_terminal_cost_without_time_and_one_of_a_value_function_object():
 def test_a_trained_value_function_as_terminal_cost():
     """A network as MX: the costate at the window's end is its gradient, for both solvers."""
     torch = pytest.importorskip("torch")
-    from nocl.to_casadi import to_casadi
+    from nocl.exports.casadi_forms import to_casadi
 
     ocp = nocl.load_ocp("pendulum")
     torch.manual_seed(0)
@@ -202,7 +202,7 @@ def test_distinct_optima_are_listed():
 
 def test_mirror_images_and_sides():
     """Dubins is its own mirror image at py = 0: found, used, and a start passes the obstacle on either side."""
-    from nocl.solvers import guesses
+    from nocl.solvers.nmpc import guesses
 
     ocp = nocl.load_ocp("dubins")
     assert [(x.tolist(), u.tolist()) for x, u in guesses.mirrors(ocp)] == [([1, -1, -1], [1, -1])]

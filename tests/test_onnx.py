@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from test_to_casadi import feature_net, jacobian, rows
 
-from nocl.from_onnx import from_onnx
+from nocl.exports.onnx_reader import from_onnx
+from nocl.exports.onnx_writer import Session, to_onnx
 from nocl.nets import MLP, FeatureNet
-from nocl.to_onnx import Session, to_onnx
 
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")

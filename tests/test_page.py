@@ -16,11 +16,11 @@ from PIL import Image
 
 import nocl
 from nocl.comparisons import compare
-from nocl.comparisons import payload as packing
-from nocl.comparisons.animate import animate, so_far
-from nocl.comparisons.drawings import drawing, phase
-from nocl.comparisons.explain import worst
-from nocl.comparisons.findings import (
+from nocl.comparisons.report import payload as packing
+from nocl.comparisons.report.animate import animate, so_far
+from nocl.comparisons.report.drawings import drawing, phase
+from nocl.comparisons.report.explain import worst
+from nocl.comparisons.report.findings import (
     Loss,
     MethodAudit,
     Promise,
@@ -31,10 +31,10 @@ from nocl.comparisons.findings import (
     Stability,
     ValueAudit,
 )
-from nocl.comparisons.page import script_json
-from nocl.comparisons.report import Judged, Report
-from nocl.comparisons.tables import Table, tables
-from nocl.simulate import Simulation
+from nocl.comparisons.report.page import script_json
+from nocl.comparisons.report.results import Judged, Report
+from nocl.comparisons.report.tables import Table, tables
+from nocl.judge import Simulation
 from nocl.solvers import LQR
 from nocl.systems import double_integrator
 

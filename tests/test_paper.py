@@ -11,13 +11,13 @@ import torch
 
 import nocl
 from nocl import hjb
-from nocl.fused import FusedStep
-from nocl.integrate import rk4_cost
-from nocl.simulate import simulate
+from nocl.exports.casadi_forms import to_casadi
+from nocl.judge import simulate
 from nocl.solvers.cnd.paper import PaperSettings, _side_by_side, _Trainer, controller_net, train_paper, value_net
 from nocl.systems import cartpole, double_integrator, dubins, quadrotor
-from nocl.to_casadi import to_casadi
-from nocl.to_torch import to_torch
+from nocl.translate.fused import FusedStep
+from nocl.translate.rk4 import rk4_cost
+from nocl.translate.torch_functions import to_torch
 
 TINY = {"iterations": 4, "batch": 4, "race": 2, "race_iterations": 2, "race_batch": 2, "intervals": 5}
 

@@ -15,9 +15,9 @@ import pytest
 from test_export import STATES, TIMES, untrained
 
 import nocl
-from nocl import parity
-from nocl.export import export
-from nocl.to_c import load
+from nocl.exports import parity
+from nocl.exports.bundle import export
+from nocl.exports.c_code import load
 
 CONTROLLER = untrained()
 

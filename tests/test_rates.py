@@ -7,13 +7,13 @@ import pytest
 import torch
 
 import nocl
-from nocl.simulate import simulate
-from nocl.solvers.bank import SolutionBank
+from nocl.judge import simulate
 from nocl.solvers.cnd import TrainSettings
 from nocl.solvers.cnd.features import at_rate, policy_net
 from nocl.solvers.cnd.labels import LONGEST, Labels, at_other_rates, tube
-from nocl.solvers.ddp import DDP
-from nocl.solvers.global_search import solve_globally
+from nocl.solvers.ddp.bank import SolutionBank
+from nocl.solvers.ddp.global_search import solve_globally
+from nocl.solvers.ddp.solver import DDP
 
 SETTINGS = TrainSettings(intervals=40, seeds=4, starts=2, states=60, tails=400, visits=200, rounds=0, iterations=1000,
                          batch=512, hidden=(24, 24), held_out=16, gap_median=1e-9, control_dt=True, value=False)

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 import nocl
-from nocl.comparisons import compare, figures
-from nocl.comparisons.files import write_report
-from nocl.comparisons.page import plotly_js
+from nocl.comparisons import compare
+from nocl.comparisons.report import figures
+from nocl.comparisons.report.files import write_report
+from nocl.comparisons.report.page import plotly_js
 from nocl.solvers import LQR
 from nocl.systems import double_integrator
 

@@ -6,7 +6,7 @@ import io
 
 import pytest
 
-from nocl import cli
+from nocl.cli import commands
 from nocl.comparisons.reproduce import sysid, sysid_tables
 
 TINY = sysid.Plan(iterations=3, seeds=2, systems=("dubins",), ways=("relu-values", "sine-gradients", "nocl"),
@@ -90,7 +90,7 @@ def test_the_command(made, capsys):
     folder, _ = made
     words = ["reproduce", "sysid", "--quick", "--iterations", "3", "--seeds", "2", "--systems", "dubins", "--ways",
              ",".join(TINY.ways), "--out", str(folder)]
-    assert cli.main(words) == 0
+    assert commands.main(words) == 0
     assert "| dubins | ReLU (without gradients) | 3 x 256, 128 wide; " in capsys.readouterr().out
-    assert cli.main(["reproduce", "sysid", "--systems", "mars", "--out", str(folder)]) == 2
-    assert cli.main(["reproduce"]) == 2
+    assert commands.main(["reproduce", "sysid", "--systems", "mars", "--out", str(folder)]) == 2
+    assert commands.main(["reproduce"]) == 2

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 import nocl
-from nocl.cli import main
+from nocl.cli.commands import main
 from nocl.comparisons.reproduce import control, control_tables
 from nocl.comparisons.reproduce.control import Made, Plan
-from nocl.solvers.ddp import DDP
+from nocl.solvers.ddp.solver import DDP
 from nocl.solvers.lqr import LQR
 
 

@@ -58,8 +58,8 @@ def test_a_feedback_is_rolled_out_for_all_states_at_once():
 
 def test_both_sides_and_both_turning_directions_are_taken_each_where_it_is_better():
     """The shipped controller on states and their mirror images: mirrored paths, each at the cost of the best one."""
-    from nocl.simulate import simulate
-    from nocl.solvers.ddp import DDP
+    from nocl.judge import simulate
+    from nocl.solvers.ddp.solver import DDP
 
     ocp, mirror = nocl.load_ocp("dubins"), np.array([1.0, -1.0, -1.0])
     x0 = np.array([[-3.0, 1.0, 1.5], [-2.8, 2.0, -2.5], [-3.2, 0.6, 2.6], [-3.0, 2.0, 0.5]])

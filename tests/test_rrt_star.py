@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import nocl
-from nocl.simulate import simulate
+from nocl.judge import simulate
 
 pytest.importorskip("ompl")
 

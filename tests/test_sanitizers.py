@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import nocl
-from nocl.kernels import CACHE_VARIABLE
-from nocl.solvers.ddp import DDP
+from nocl.solvers.ddp.solver import DDP
+from nocl.translate.kernels import CACHE_VARIABLE
 
 ROOT = Path(__file__).resolve().parents[1]
 SANITIZERS = "-fsanitize=address,undefined -fno-sanitize-recover=all -g1"

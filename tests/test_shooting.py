@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 import torch
 
-from nocl.known import Stated
-from nocl.logs import Log
-from nocl.shooting import Windows, _Problem, fit_simulation
-from nocl.sysid_labels import box_of
-from nocl.sysid_logs import initial
-from nocl.sysid_networks import assemble
-from nocl.sysid_settings import LogSettings
+from nocl.sysid.from_log import initial
+from nocl.sysid.labels import box_of
+from nocl.sysid.logs.log import Log
+from nocl.sysid.logs.shooting import Windows, _Problem, fit_simulation
+from nocl.sysid.networks import assemble
+from nocl.sysid.settings import LogSettings
+from nocl.sysid.stated import Stated
 from nocl.systems import pendulum
 
 SMALL = LogSettings(width=3, window=4)

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 import nocl
-from nocl.simulate import simulate
+from nocl.judge import simulate
 from nocl.solvers import LQR
 from nocl.systems import double_integrator, dubins
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from nocl import store
 from nocl.nets import MLP, FeatureNet
+from nocl.support import store
 
 
 def network(dtype: torch.dtype = torch.float64, skip: bool = True) -> FeatureNet:

@@ -6,7 +6,7 @@ import pytest
 
 import nocl
 from nocl.data import Dataset
-from nocl.structure import Box, Expansion, evaluate, find, plain, read
+from nocl.sysid.structure import Box, Expansion, evaluate, find, plain, read
 from nocl.systems import acrobot, cartpole, dubins, quadrotor, van_der_pol
 
 

@@ -11,15 +11,15 @@ from scipy.stats import binom
 import nocl
 from nocl.comparisons import compare, robustness, study
 from nocl.comparisons.audit import EXACT, LEARNED, audit
-from nocl.comparisons.findings import Loss, quantiles
+from nocl.comparisons.disturbances import Disturbances, mass_variants, on_plant, plant
 from nocl.comparisons.promise import interval, lower_bound, promises
 from nocl.comparisons.reference import Reference, resolved
 from nocl.comparisons.region import grown, region
-from nocl.comparisons.robustness import Disturbances, mass_variants, on_plant, plant
+from nocl.comparisons.report.findings import Loss, quantiles
+from nocl.comparisons.report.tables import tables
 from nocl.comparisons.stability import local, stability
-from nocl.comparisons.tables import tables
 from nocl.solvers import LQR, NMPC
-from nocl.solvers.compiled import fingerprint
+from nocl.support.compiler import fingerprint
 from nocl.systems import double_integrator, dubins
 
 
@@ -223,7 +223,7 @@ def test_the_resolved_optimum_of_a_linear_problem(ocp):
     V = lambda x, t: np.array([lqr.value(row, t) for row in x])  # noqa: E731
     first = start.x[:, 80]
     after = Reference(ocp, 320).solve(x0)  # the path from the kicked state
-    from nocl.simulate import simulate
+    from nocl.judge import simulate
     kicked = simulate(ocp, lqr, x0, kicks=[(0.5, dx[0]), (1.5, -dx[0])])
     np.testing.assert_allclose(cost, kicked.cost, rtol=2e-3)
     assert (V(first + dx, 0.5) != V(first, 0.5)).all()

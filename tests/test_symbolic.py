@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from nocl.symbolic import BINARY, UNARY, expand, from_data, instructions, to_data
+from nocl.translate.instructions import BINARY, UNARY, expand, from_data, instructions, to_data
 
 X, Y = ca.SX.sym("x"), ca.SX.sym("y")
 

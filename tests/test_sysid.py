@@ -10,12 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import nocl
-from nocl import fit
 from nocl.data import Dataset
-from nocl.structure import plain
-from nocl.sysid import LearnedDynamics, PaperSettings, Settings, identify
-from nocl.sysid_labels import Source
-from nocl.sysid_networks import LEAST, NARROWEST, PROBES, SHARE, Draws, _widest, frequencies, weights_of
+from nocl.sysid import fitting
+from nocl.sysid.identification import LearnedDynamics, PaperSettings, Settings, identify
+from nocl.sysid.labels import Source
+from nocl.sysid.networks import LEAST, NARROWEST, PROBES, SHARE, Draws, _widest, frequencies, weights_of
+from nocl.sysid.structure import plain
 from nocl.systems import acrobot, cartpole, dubins, pendulum, quadrotor
 
 SMALL = Settings(iterations=150, polish=12, polish_batch=256, samples=20_000)
@@ -31,12 +31,12 @@ def rows(system: nocl.System, n: int = 7, seed: int = 0) -> tuple[torch.Tensor, 
     return torch.from_numpy(data.x), torch.from_numpy(data.u)
 
 
-def network(seed: int = 0, F: int = 3, h: int = 5, m: int = 2) -> fit.Weights:
+def network(seed: int = 0, F: int = 3, h: int = 5, m: int = 2) -> fitting.Weights:
     g = torch.Generator().manual_seed(seed)
     return [torch.randn(*s, generator=g, dtype=torch.float64) for s in ((h, F + 1), (h, h + 1), (m, h + 1 + F))]
 
 
-def wave(n: int = 400) -> fit.Samples:
+def wave(n: int = 400) -> fitting.Samples:
     """y = (sin 2a + b^2, cos(a b)) of variables a, b as features (sin a, cos a, b), with derivatives."""
     a, b = torch.rand(2, n, generator=torch.Generator().manual_seed(1), dtype=torch.float64) * 2 - 1
     phi = torch.stack([a.sin(), a.cos(), b], 1)
@@ -44,7 +44,7 @@ def wave(n: int = 400) -> fit.Samples:
     y = torch.stack([(2 * a).sin() + b**2, (a * b).cos()], 1)
     dy = torch.stack([torch.stack([2 * (2 * a).cos(), 2 * b], 1),
                       torch.stack([-b * (a * b).sin(), -a * (a * b).sin()], 1)], 1)
-    return fit.Samples(phi, slope, torch.tensor([0, 0, 1]), y, dy)
+    return fitting.Samples(phi, slope, torch.tensor([0, 0, 1]), y, dy)
 
 
 def test_a_small_budget_learns_cartpole(model):
@@ -204,7 +204,7 @@ def test_levenberg_marquardt_has_four_labels_a_weight(gradients, monkeypatch):
         seen.append((found.y.numel(), sum(w.numel() for w in weights)))
         return weights
 
-    monkeypatch.setattr(fit, "levenberg_marquardt", spy)
+    monkeypatch.setattr(fitting, "levenberg_marquardt", spy)
     settings = Settings(width=24, iterations=0, polish=1, polish_batch=16)
     identify(cartpole.system(), data=Dataset.sample(cartpole.system(), 5000, 1), gradients=gradients, settings=settings,
              progress=False)
@@ -304,10 +304,10 @@ def test_tangents_are_derivatives():
     """The propagated tangents of features and labels equal finite differences along each variable."""
     samples, weights, h = wave(5), network(), 1e-6
     batch = samples.batch(torch.arange(5), torch.eye(2))
-    tangents = fit.forward(weights, batch.phi)[1:]
+    tangents = fitting.forward(weights, batch.phi)[1:]
 
     def value(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-        return fit.forward(weights, torch.stack([a.sin(), a.cos(), b], 1)[None])[0]
+        return fitting.forward(weights, torch.stack([a.sin(), a.cos(), b], 1)[None])[0]
 
     a, b = torch.atan2(samples.phi[:, 0], samples.phi[:, 1]), samples.phi[:, 2]
     torch.testing.assert_close(tangents[0], (value(a + h, b) - value(a - h, b)) / (2 * h), rtol=1e-6, atol=1e-7)
@@ -318,10 +318,10 @@ def test_gauss_newton_is_automatic_differentiation():
     samples, weights = wave(40), network()
     batch = samples.batch(torch.arange(40), torch.eye(2))
     scale = torch.rand(3, 1, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
-    jacobian = torch.func.jacrev(lambda *w: fit.forward(w, batch.phi), argnums=(0, 1, 2))(*weights)
+    jacobian = torch.func.jacrev(lambda *w: fitting.forward(w, batch.phi), argnums=(0, 1, 2))(*weights)
     J = (torch.cat([j.flatten(3) for j in jacobian], 3) * scale[..., None]).flatten(0, 2)
-    r = ((fit.forward(weights, batch.phi) - batch.y) * scale).flatten()
-    JJ, Jr, square = fit.gauss_newton(weights, batch, scale, chunk=16)
+    r = ((fitting.forward(weights, batch.phi) - batch.y) * scale).flatten()
+    JJ, Jr, square = fitting.gauss_newton(weights, batch, scale, chunk=16)
     torch.testing.assert_close(JJ, J.T @ J / 40, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(Jr, J.T @ r / 40, rtol=1e-4, atol=1e-4)
     assert square == pytest.approx(float(r @ r) / 40, rel=1e-12)
@@ -330,11 +330,11 @@ def test_gauss_newton_is_automatic_differentiation():
 def test_levenberg_marquardt_lowers_the_residual():
     samples = wave()
     draws = Draws(samples, 1.0, torch.Generator().manual_seed(0))
-    start = fit.initial(3, 12, samples, torch.Generator().manual_seed(0))
+    start = fitting.initial(3, 12, samples, torch.Generator().manual_seed(0))
     history: list[float] = []
-    end = fit.levenberg_marquardt(start, draws, steps=25, batch=400, report=history.append)
+    end = fitting.levenberg_marquardt(start, draws, steps=25, batch=400, report=history.append)
     batch, scale = draws(400)
-    before, after = (float(fit.loss([w.double() for w in weights], batch, scale)) for weights in (start, end))
+    before, after = (float(fitting.loss([w.double() for w in weights], batch, scale)) for weights in (start, end))
     assert after < 1e-4 * before
     assert len(history) == 25
 
@@ -352,16 +352,16 @@ def test_first_weights_go_with_the_frequency():
 def test_soap_lowers_the_loss():
     samples = wave().to(torch.float32)
     draws = Draws(samples, 1.0, torch.Generator().manual_seed(0))
-    start = fit.initial(3, 12, samples, torch.Generator().manual_seed(0))
-    end = fit.soap(start, draws, iterations=300, batch=128, lr=1e-2, report=lambda _: None)
+    start = fitting.initial(3, 12, samples, torch.Generator().manual_seed(0))
+    end = fitting.soap(start, draws, iterations=300, batch=128, lr=1e-2, report=lambda _: None)
     batch, scale = draws(400)
-    assert fit.loss(end, batch, scale) < 0.1 * fit.loss(start, batch, scale)
+    assert fitting.loss(end, batch, scale) < 0.1 * fitting.loss(start, batch, scale)
 
 
 def test_random_directions_are_unbiased():
     """The mean square of a derivative along them is that of the whole gradient, whatever the number of variables."""
     v, m = 8, 1
-    samples = fit.Samples(torch.zeros(10, v), torch.ones(10, v), torch.arange(v), torch.zeros(10, m),
+    samples = fitting.Samples(torch.zeros(10, v), torch.ones(10, v), torch.arange(v), torch.zeros(10, m),
                           torch.arange(1.0, v + 1).expand(10, m, v))
     draws = Draws(samples, 1.0, torch.Generator().manual_seed(0))
     squares = [((b.y[1:] * s[1:]) ** 2).mean() for b, s in (draws(1) for _ in range(3000))]
@@ -371,7 +371,7 @@ def test_random_directions_are_unbiased():
 def test_weights_of_a_layered_network_come_back(model):
     for net in model.net.nets:
         phi = torch.randn(4, net.sizes[0], dtype=torch.float64)
-        torch.testing.assert_close(fit.forward(weights_of(net), phi[None])[0], net(phi), rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(fitting.forward(weights_of(net), phi[None])[0], net(phi), rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.slow

@@ -8,16 +8,16 @@ import pytest
 import torch
 
 import nocl
-from nocl import fit
-from nocl.affine import affine_in_controls
 from nocl.data import Dataset
-from nocl.known import Stated
-from nocl.structure import Box, read
-from nocl.sysid import LearnedDynamics, Settings, identify
-from nocl.sysid_affine import better_affine
-from nocl.sysid_labels import Source, box_of, draw_pool, find_structure
-from nocl.sysid_networks import _samples
-from nocl.sysid_progress import Progress
+from nocl.sysid import fitting
+from nocl.sysid.affine import affine_in_controls
+from nocl.sysid.identification import LearnedDynamics, Settings, identify
+from nocl.sysid.labels import Source, box_of, draw_pool, find_structure
+from nocl.sysid.networks import _samples
+from nocl.sysid.progress import Progress
+from nocl.sysid.stated import Stated
+from nocl.sysid.structure import Box, read
+from nocl.sysid.trial import better_affine
 from nocl.systems import cartpole
 
 SMALL = Settings(width=16, iterations=200, batch=256, polish=25, polish_batch=256)
@@ -41,7 +41,7 @@ def slope_in_u(model: LearnedDynamics, u: float) -> torch.Tensor:
     return torch.func.jacfwd(lambda c: model(x, c)[0])(torch.tensor([[u]], dtype=torch.float64))[:, 0, 0].detach()
 
 
-def mixture(n: int = 50) -> tuple[fit.Samples, fit.Weights]:
+def mixture(n: int = 50) -> tuple[fitting.Samples, fitting.Weights]:
     """Labels of a network of (sin a, cos a, b) with outputs y0, y1, y2: y0 + w y1 and y2, w a third variable."""
     g = torch.Generator().manual_seed(4)
     a, b, w = torch.rand(3, n, generator=g, dtype=torch.float64) * 2 - 1
@@ -49,11 +49,11 @@ def mixture(n: int = 50) -> tuple[fit.Samples, fit.Weights]:
     slope = torch.stack([a.cos(), -a.sin(), torch.ones_like(b)], 1)
     place = torch.tensor([[[1, 0], [0, 1], [0, 0]], [[0, 0], [0, 0], [1, 0]]], dtype=torch.float64)
     rate = torch.tensor([[0, 0, 0], [0, 0, 0.5]], dtype=torch.float64)
-    mix = fit.Mix(torch.stack([torch.ones_like(w), 0.5 * w], 1), place, rate)
+    mix = fitting.Mix(torch.stack([torch.ones_like(w), 0.5 * w], 1), place, rate)
     y, dy = torch.randn(n, 2, generator=g).double(), torch.randn(n, 2, 3, generator=g).double()
     shapes = ((5, 4), (5, 6), (3, 9))
     weights = [torch.randn(s, generator=g, dtype=torch.float64) for s in shapes]
-    return fit.Samples(phi, slope, torch.tensor([0, 0, 1]), y, dy, mix), weights
+    return fitting.Samples(phi, slope, torch.tensor([0, 0, 1]), y, dy, mix), weights
 
 
 def test_tangents_of_mixed_labels_are_derivatives():
@@ -63,11 +63,11 @@ def test_tangents_of_mixed_labels_are_derivatives():
 
     def label(z: torch.Tensor) -> torch.Tensor:
         phi = torch.stack([z[0].sin(), z[0].cos(), z[1]])
-        y = fit.forward(weights, phi[None, None])[0, 0]
+        y = fitting.forward(weights, phi[None, None])[0, 0]
         return torch.stack([y[0] + 0.5 * z[2] * y[1], y[2]])
 
     batch = samples.batch(torch.tensor([0]), torch.eye(3))
-    got = fit.mixed(fit.forward(weights, batch.phi), batch.mix)[:, 0]
+    got = fitting.mixed(fitting.forward(weights, batch.phi), batch.mix)[:, 0]
     z = torch.stack([a, b, w])
     torch.testing.assert_close(got[0], label(z), rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(got[1:], torch.func.jacfwd(label)(z).T, rtol=1e-10, atol=1e-10)
@@ -79,12 +79,12 @@ def test_gauss_newton_of_mixed_labels_is_automatic_differentiation():
     scale = torch.rand(4, 1, 2, generator=torch.Generator().manual_seed(2), dtype=torch.float64)
 
     def labels(*w):
-        return fit.mixed(fit.forward(w, batch.phi), batch.mix)
+        return fitting.mixed(fitting.forward(w, batch.phi), batch.mix)
 
     jacobian = torch.func.jacrev(labels, argnums=(0, 1, 2))(*weights)
     J = (torch.cat([j.flatten(3) for j in jacobian], 3) * scale[..., None]).flatten(0, 2)
     r = ((labels(*weights) - batch.y) * scale).flatten()
-    JJ, Jr, square = fit.gauss_newton(weights, batch, scale, chunk=16)
+    JJ, Jr, square = fitting.gauss_newton(weights, batch, scale, chunk=16)
     torch.testing.assert_close(JJ, J.T @ J / 50, rtol=1e-4, atol=1e-4)
     torch.testing.assert_close(Jr, J.T @ r / 50, rtol=1e-4, atol=1e-4)
     assert square == pytest.approx(float(r @ r) / 50, rel=1e-12)
@@ -119,7 +119,7 @@ def test_exact_coefficients_meet_the_labels(known):
         dy = slope[:, c][:, :, variables] * unit / spread[:, None]
         outputs = torch.from_numpy(np.concatenate([y[None], dy.transpose(2, 0, 1)]))
         batch = samples.batch(torch.arange(100), torch.eye(len(variables)))
-        torch.testing.assert_close(fit.mixed(outputs, batch.mix), batch.y, rtol=0, atol=1e-12)
+        torch.testing.assert_close(fitting.mixed(outputs, batch.mix), batch.y, rtol=0, atol=1e-12)
 
 
 def test_rows_kept_apart_are_not_fitted(monkeypatch):
@@ -131,7 +131,7 @@ def test_rows_kept_apart_are_not_fitted(monkeypatch):
         seen.append(part.data[0])
         raise InterruptedError
 
-    monkeypatch.setattr("nocl.sysid_affine.fit_groups", spy)
+    monkeypatch.setattr("nocl.sysid.trial.fit_groups", spy)
     parts = find_structure(source, Settings(), 0, Stated.of(plant(), None, False))
     with pytest.raises(InterruptedError):
         better_affine(source, parts, Settings(), 0, Progress("", False))

@@ -7,8 +7,8 @@ from torch import Tensor
 from torch.nn.utils import parameters_to_vector
 
 from nocl.nets import ACTIVATIONS, MLP
-from nocl.sysid import PaperSettings, identify
-from nocl.sysid_loss import Loss
+from nocl.sysid.identification import PaperSettings, identify
+from nocl.sysid.loss import Loss
 from nocl.systems import cartpole
 
 ROWS = torch.tensor([3, 0, 7, 7, 11, 2, 19, 5, 4])  # an odd number, one twice

@@ -15,7 +15,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import nocl
-from nocl import checks, pretty
+from nocl import pretty
+from nocl.support import checks
 from nocl.systems import NAMES
 
 

@@ -9,8 +9,8 @@ import pytest
 from numpy import cos, pi, sin
 
 import nocl
-from nocl.integrate import rk4
 from nocl.systems import NAMES
+from nocl.translate.rk4 import rk4
 
 RNG = np.random.default_rng  # every test seeds its own
 

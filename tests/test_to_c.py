@@ -16,9 +16,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from nocl.exports.c_code import to_c
+from nocl.exports.casadi_forms import to_casadi
 from nocl.nets import MLP, FeatureNet
-from nocl.to_c import to_c
-from nocl.to_casadi import to_casadi
 
 BOUNDS = {"x": ([-1.0, -2.0, -3.0], [1.0, 2.0, 3.0]), "t": (0.0, 4.0), "u": (-1.0, 1.0)}
 LABELS = {"x": ["p [m]", "v [m/s]", "theta [rad]"], "t": ["time [s]"], "u": ["force [N]", "torque [N m]"]}

@@ -13,9 +13,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from nocl.integrate import rk4
+from nocl.exports.casadi_forms import to_casadi
 from nocl.nets import ACTIVATIONS, MLP, FeatureNet, Sine
-from nocl.to_casadi import to_casadi
+from nocl.translate.rk4 import rk4
 
 LAYERS = [nn.Tanh, nn.ReLU, nn.SiLU, nn.Sigmoid, nn.Softplus, nn.GELU, nn.ELU, nn.LeakyReLU, nn.Identity, Sine,
           lambda: nn.GELU("tanh"), lambda: nn.Softplus(3.0, 5.0), lambda: nn.ELU(0.3), nn.Dropout]

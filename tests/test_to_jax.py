@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from nocl import load_ocp
-from nocl.symbolic import BINARY, UNARY
 from nocl.systems import NAMES
+from nocl.translate.instructions import BINARY, UNARY
 
 jax = pytest.importorskip("jax")
 
-from nocl.to_jax import to_jax  # noqa: E402
+from nocl.translate.jax_functions import to_jax  # noqa: E402
 
 DOMAIN = {"OP_LOG": (0.1, 3), "OP_SQRT": (0.1, 3), "OP_ASIN": (-0.9, 0.9), "OP_ACOS": (-0.9, 0.9),
           "OP_ACOSH": (1.1, 3), "OP_ATANH": (-0.9, 0.9), "OP_LOG1P": (-0.9, 3), "OP_ERFINV": (-0.9, 0.9),

@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.func import jacrev, vmap
 
-from nocl.checks import COPYSIGN_WRONG
-from nocl.symbolic import BINARY, UNARY, instructions
-from nocl.to_torch import BOOLEAN, COPIES, FLOAT_OPS, to_torch
+from nocl.support.checks import COPYSIGN_WRONG
+from nocl.translate.instructions import BINARY, UNARY, instructions
+from nocl.translate.torch_functions import BOOLEAN, COPIES, FLOAT_OPS, to_torch
 
 F64 = torch.float64
 

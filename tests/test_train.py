@@ -11,11 +11,9 @@ import torch
 
 import nocl
 from nocl.hjb import hjb_residual
-from nocl.integrate import rk4_interval
+from nocl.judge import simulate
 from nocl.nets import MLP, FeatureNet
-from nocl.simulate import simulate
 from nocl.solvers import NMPC
-from nocl.solvers.bank import SolutionBank, extend
 from nocl.solvers.cnd import TrainSettings
 from nocl.solvers.cnd.features import policy_net
 from nocl.solvers.cnd.labels import (
@@ -30,10 +28,12 @@ from nocl.solvers.cnd.labels import (
 from nocl.solvers.cnd.regress import fit, policy_loss
 from nocl.solvers.cnd.validate import advice, gap, refined, summary, value_scores
 from nocl.solvers.cnd.value import ROUND, ValueLabels, on_fine_grid, value_loss, value_net, value_tails
-from nocl.solvers.ddp import DDP
-from nocl.solvers.global_search import solve_globally
+from nocl.solvers.ddp.bank import SolutionBank, extend
+from nocl.solvers.ddp.global_search import solve_globally
+from nocl.solvers.ddp.solver import DDP
+from nocl.translate.rk4 import rk4_interval
 
-module = importlib.import_module("nocl.solvers.cnd.train")  # the package has a function of that name
+module = importlib.import_module("nocl.solvers.cnd.training")  # the package has a function of that name
 
 QUICK = TrainSettings(intervals=40, seeds=4, starts=2, states=60, tails=400, visits=200, rounds=0, iterations=800,
                       batch=512, hidden=(24, 24), value_initial=100, value_tails=800,

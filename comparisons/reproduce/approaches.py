@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from nocl import store
-from nocl.checks import Array
 from nocl.comparisons.reproduce.cells import read_cell
 from nocl.comparisons.reproduce.dubins import rollout_ms
 from nocl.ocp import OCP
-from nocl.solvers.compiled import fingerprint
+from nocl.support import store
+from nocl.support.checks import Array
+from nocl.support.compiler import fingerprint
 from nocl.systems import load_ocp
 
 PROBLEMS = ("double_integrator", "pendulum", "dubins", "cartpole", "acrobot", "quadrotor")
@@ -112,7 +112,7 @@ def _read(path: Path) -> Cell:
 
 def _level_sets(problem: str, plan: Plan) -> Cell:
     """Solved up to 3 states; of 4 predicted by the compiled solver and a timed step; beyond, the nodes are counted."""
-    from nocl.solvers.levelset import LevelSet
+    from nocl.solvers.levelset.solver import LevelSet
 
     ocp, nan = load_ocp(problem), float("nan")
     nx, covers, key = ocp.system.nx, "V(x, t) on the whole box", _key("level-sets", plan, problem)
@@ -133,7 +133,7 @@ def _level_sets(problem: str, plan: Plan) -> Cell:
 
 
 def _nmpc(problem: str, plan: Plan) -> Cell:
-    from nocl.solvers.nmpc import NMPC
+    from nocl.solvers.nmpc.solver import NMPC
 
     ocp = load_ocp(problem)
     start = time.perf_counter()
@@ -163,8 +163,8 @@ def _cnd(problem: str, plan: Plan) -> Cell:
 
 def _error(ocp: OCP, x0: Array, V: Any) -> float:
     """Mean |V - J| / J over the states; where V has no answer, the states are left out."""
-    from nocl.solvers.ddp import DDP
-    from nocl.solvers.global_search import solve_globally
+    from nocl.solvers.ddp.global_search import solve_globally
+    from nocl.solvers.ddp.solver import DDP
 
     best = solve_globally(DDP(ocp, intervals=REFERENCE), x0, seed=0).best
     wrong = np.abs(np.asarray(V).ravel() - best.cost) / best.cost
@@ -201,7 +201,7 @@ def figure(cells: Sequence[Cell]) -> bytes:
     import matplotlib
     from matplotlib.figure import Figure
 
-    from nocl.comparisons.style import COLOURS, STYLE, encode
+    from nocl.comparisons.report.style import COLOURS, STYLE, encode
 
     quantities = {"memory": "memory, MB", "before": "s before", "ms": "ms a state", "error": "mean error of V"}
     with matplotlib.rc_context(STYLE):

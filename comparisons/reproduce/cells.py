@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from nocl import store
+from nocl.support import store
 
 Cell = TypeVar("Cell")
 

@@ -23,19 +23,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from nocl import store
-from nocl.checks import Array
 from nocl.comparisons.reproduce.cells import read_cell
 from nocl.comparisons.reproduce.dubins import INTERVALS, rollout_ms
+from nocl.judge import simulate
 from nocl.ocp import OCP
-from nocl.simulate import simulate
-from nocl.solvers.compiled import fingerprint
-from nocl.solvers.loop import Loop
+from nocl.solvers.nmpc.loop import Loop
+from nocl.support import store
+from nocl.support.checks import Array
+from nocl.support.compiler import fingerprint
 from nocl.systems import load_ocp, quadrotor
 
 if TYPE_CHECKING:
     from nocl.solvers.cnd.paper import PaperSettings
-    from nocl.sysid import LearnedDynamics
+    from nocl.sysid.identification import LearnedDynamics
 
 CELLS = "cells"
 HIDDEN = 500_000  # + seed: the seed of the initial states that cells are judged on
@@ -212,7 +212,7 @@ def _judged(cell: Cell, ocp: OCP, controller: Any, x0: Array) -> Cell:
 
 
 def _identified(ocp: OCP, seed: int, plan: Plan) -> LearnedDynamics:
-    from nocl.sysid import Settings, identify
+    from nocl.sysid.identification import Settings, identify
 
     settings = Settings(iterations=100, polish=5, samples=10_000) if plan.quick else None
     return identify(ocp.system, seed=seed, settings=settings, progress=False)
@@ -271,7 +271,7 @@ def _no_control_cost(make: Callable[[Task], Made], task: Task) -> Made:
 
 
 def _nmpc(task: Task) -> Made:
-    from nocl.solvers.nmpc import NMPC
+    from nocl.solvers.nmpc.solver import NMPC
 
     return Made(NMPC(task.ocp, INTERVALS, dynamics=task.model, seed=task.seed).controller(),
                 f"closed loop, {INTERVALS} intervals, solved again at each")

@@ -10,8 +10,8 @@ from dataclasses import asdict, astuple, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nocl import store
 from nocl.comparisons.reproduce.control import TABLES, Cell, Entry, Published, Way, table
+from nocl.support import store
 from nocl.systems import load_ocp
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ HEAD = ("problem", "way", "trained on", "terminal error", "of a seed", "control"
 
 def write(folder: str | Path, cells: Sequence[Cell], name: str) -> list[Path]:
     """NAME.md, .tex, .csv and .png in the folder, and of the quadrotor's flights NAME-3d.png; their paths."""
-    from nocl.comparisons.style import encode
+    from nocl.comparisons.report.style import encode
 
     entries, folder = table(cells, name), Path(folder)
     texts = {"md": markdown(entries, name), "tex": latex(entries, name), "csv": as_csv(entries, name)}
@@ -126,7 +126,7 @@ def figure(entries: Sequence[Entry], name: str) -> Figure:
     from matplotlib.figure import Figure
     from matplotlib.ticker import LogLocator, NullFormatter
 
-    from nocl.comparisons.style import COLOURS, STYLE
+    from nocl.comparisons.report.style import COLOURS, STYLE
 
     t = TABLES[name]
     problems = [p for p in t.problems if any(e.problem == p for e in entries)]
@@ -153,7 +153,7 @@ def _dynamics(way: Way) -> str:
 
 
 def _dots(axes: Axes, entries: dict[str, Entry], ways: dict[str, Way], problem: str) -> None:
-    from nocl.comparisons.style import COLOURS
+    from nocl.comparisons.report.style import COLOURS
 
     for place, (key, way) in enumerate(ways.items()):
         e, paper = entries.get(key), way.paper.get(problem)
@@ -170,7 +170,7 @@ def flights(cells: Sequence[Cell], name: str) -> Figure:
     import numpy as np
     from matplotlib.figure import Figure
 
-    from nocl.comparisons.style import COLOURS, STYLE
+    from nocl.comparisons.report.style import COLOURS, STYLE
 
     shown = [c for c in cells if c.paths and c.seed == min(c.seed for c in cells if c.paths)]
     rows, ways = math.ceil(len(shown) / COLUMNS), TABLES[name].ways

@@ -18,15 +18,15 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from nocl import store
-from nocl.checks import Array
-from nocl.comparisons.report import VIOLATION
+from nocl.comparisons.report.results import VIOLATION
 from nocl.comparisons.reproduce.cells import read_cell
-from nocl.integrate import rk4
+from nocl.judge import Simulation, simulate
 from nocl.ocp import OCP
-from nocl.simulate import Simulation, simulate
-from nocl.solvers.compiled import fingerprint
+from nocl.support import store
+from nocl.support.checks import Array
+from nocl.support.compiler import fingerprint
 from nocl.systems import load_ocp
+from nocl.translate.rk4 import rk4
 
 TOLERANCE = 0.1
 INTERVALS = 80
@@ -145,7 +145,7 @@ def rollout_ms(ocp: OCP, controller: Callable[[Array, float], Array], x0: Array)
 
     A state to which the controller has no answer stays where it is: only the time counts here.
     """
-    from nocl.threads import one_thread
+    from nocl.support.threads import one_thread
 
     x, h, f = x0, ocp.horizon / INTERVALS, ocp.system.f
     with one_thread():
@@ -171,7 +171,7 @@ def _rrt(iterations: int) -> Callable[..., Made]:
 
 
 def _nmpc(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
-    from nocl.solvers.nmpc import NMPC
+    from nocl.solvers.nmpc.solver import NMPC
 
     solver = NMPC(ocp, INTERVALS, seed=seed)
     solution = solver.solve(x0, progress=False)
@@ -180,8 +180,8 @@ def _nmpc(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
 
 
 def _optimum(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
-    from nocl.solvers.ddp import DDP
-    from nocl.solvers.global_search import solve_globally
+    from nocl.solvers.ddp.global_search import solve_globally
+    from nocl.solvers.ddp.solver import DDP
 
     ddp, start = DDP(ocp, intervals=INTERVALS), time.perf_counter()
     best = solve_globally(ddp, x0, seed=seed).best
@@ -190,7 +190,7 @@ def _optimum(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
 
 
 def _level_sets(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
-    from nocl.solvers.levelset import LevelSet, LevelSetSolution
+    from nocl.solvers.levelset.solver import LevelSet, LevelSetSolution
 
     path = folder / CELLS / "dubins-V.safetensors"
     wide = replace(ocp, penalty_margin=MARGIN)

@@ -10,8 +10,8 @@ from dataclasses import astuple, fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nocl import store
 from nocl.comparisons.reproduce.dubins import WAYS, Cell, Entry, table
+from nocl.support import store
 from nocl.systems import load_ocp
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ COLUMNS = 4  # panels in a row of the figure
 
 def write(folder: str | Path, cells: Sequence[Cell]) -> list[Path]:
     """dubins.md, .tex, .csv and .png in the folder; their paths."""
-    from nocl.comparisons.style import encode
+    from nocl.comparisons.report.style import encode
 
     entries, folder = table(cells), Path(folder)
     texts = {"md": markdown(entries), "tex": latex(entries), "csv": as_csv(entries)}
@@ -80,7 +80,7 @@ def figure(cells: Sequence[Cell]) -> Figure:
     from matplotlib.figure import Figure
     from matplotlib.patches import Circle
 
-    from nocl.comparisons.style import COLOURS, STYLE
+    from nocl.comparisons.report.style import COLOURS, STYLE
 
     shown = [c for c in cells if c.seed == min(c.seed for c in cells)]
     rows = math.ceil(len(shown) / COLUMNS)

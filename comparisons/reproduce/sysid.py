@@ -14,8 +14,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-from nocl import store
-from nocl.sysid import PaperSettings, Score, Settings, identify
+from nocl.support import store
+from nocl.sysid.identification import PaperSettings, Score, Settings, identify
 from nocl.system import System
 from nocl.systems import load_ocp
 

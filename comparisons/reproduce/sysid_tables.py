@@ -8,8 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from nocl import store
 from nocl.comparisons.reproduce.sysid import SYSTEMS, WAYS, Cell, Entry, published, table
+from nocl.support import store
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -19,7 +19,7 @@ Table = Mapping[tuple[str, str], Entry]
 
 def write(folder: str | Path, cells: Sequence[Cell]) -> list[Path]:
     """sysid.md, .tex, .csv and .png in the folder; their paths."""
-    from nocl.comparisons.style import encode
+    from nocl.comparisons.report.style import encode
 
     entries, folder = table(cells), Path(folder)
     texts = {"md": markdown(entries), "tex": latex(entries), "csv": as_csv(entries)}
@@ -99,7 +99,7 @@ def figure(entries: Table) -> Figure:
     import matplotlib
     from matplotlib.figure import Figure
 
-    from nocl.comparisons.style import COLOURS, STYLE
+    from nocl.comparisons.report.style import COLOURS, STYLE
 
     systems = _systems(entries)
     with matplotlib.rc_context(STYLE):

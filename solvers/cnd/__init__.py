@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from nocl.solvers.cnd.controller import CND, pretrained
-from nocl.solvers.cnd.settings import TrainSettings
-from nocl.solvers.cnd.train import train
+from nocl.support.lazy import hand_on
 
-__all__ = ["CND", "TrainSettings", "pretrained", "train"]
+_LAZY = {"CND": "nocl.solvers.cnd.controller", "pretrained": "nocl.solvers.cnd.controller",
+         "TrainSettings": "nocl.solvers.cnd.settings", "train": "nocl.solvers.cnd.training"}
+__all__ = list(_LAZY)
+__getattr__, __dir__ = hand_on(__name__, _LAZY)

@@ -14,16 +14,16 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-from nocl import checks, store
-from nocl.checks import Array
+from nocl.exports.casadi_forms import to_casadi
+from nocl.exports.parity import Certificate, Part
+from nocl.judge import dynamics_function
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
-from nocl.parity import Certificate, Part
-from nocl.simulate import dynamics_function
 from nocl.solvers.cnd.features import at_rate
 from nocl.solvers.cnd.labels import LONGEST
-from nocl.to_casadi import to_casadi
-from nocl.to_torch import to_torch
+from nocl.support import checks, store
+from nocl.support.checks import Array
+from nocl.translate.torch_functions import to_torch
 
 KIND = "cnd"  # the name of its file in a folder
 Build = str | os.PathLike[str] | None  # a folder for what L4CasADi compiles
@@ -152,8 +152,8 @@ class CND:
         return Path(folder)
 
     def export(self, folder: str | os.PathLike[str], to: Sequence[str] = ("casadi",), **options: Any) -> Certificate:
-        """Files of all `parts()` in `folder`, proven equal to this controller: see nocl.export.export."""
-        from nocl.export import export
+        """Files of all `parts()` in `folder`, proven equal to this controller: see nocl.exports.bundle.export."""
+        from nocl.exports.bundle import export
 
         return export(self, folder, to, **options)
 

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, cast
 import casadi as ca
 import numpy as np
 
-from nocl.checks import Array
 from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
+from nocl.support.checks import Array
 
 if TYPE_CHECKING:
     from nocl.solvers.cnd.labels import Labels

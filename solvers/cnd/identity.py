@@ -11,7 +11,7 @@ import torch
 
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
-from nocl.symbolic import to_data
+from nocl.translate.instructions import to_data
 
 
 def identity(ocp: OCP, settings: Any, seed: int, f: Any, **more: str) -> str:

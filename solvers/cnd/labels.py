@@ -11,12 +11,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from nocl.checks import Array
-from nocl.integrate import rk4
 from nocl.ocp import OCP
-from nocl.solvers.bank import SolutionBank, better
-from nocl.solvers.ddp import DDP, DDPSolution
-from nocl.to_torch import to_torch
+from nocl.solvers.ddp.bank import SolutionBank, better
+from nocl.solvers.ddp.solver import DDP, DDPSolution
+from nocl.support.checks import Array
+from nocl.translate.rk4 import rk4
+from nocl.translate.torch_functions import to_torch
 
 Field = Callable[[Tensor, Tensor], Tensor]
 SMALL = 0.1  # of a usual cost: what is added to costs before anything is divided by them

@@ -35,13 +35,14 @@ from torch import Tensor
 from torch.func import functional_call, stack_module_state
 from tqdm import tqdm
 
-from nocl import hjb, store
-from nocl.fused import FusedStep
+from nocl import hjb
 from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.cnd.identity import identity
 from nocl.solvers.cnd.paper_settings import STEPS, PaperSettings
-from nocl.to_torch import to_torch
+from nocl.support import store
+from nocl.translate.fused import FusedStep
+from nocl.translate.torch_functions import to_torch
 
 __all__ = ["PaperSettings", "train_paper"]
 TERMS = ("cost", "hjb", "final", "hamil")

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from nocl import hjb
-from nocl.integrate import rk4_cost
 from nocl.nets import ACTIVATIONS
+from nocl.translate.rk4 import rk4_cost
 
 STEPS: dict[str, hjb.Step] = {"rk4": rk4_cost, "euler": hjb.euler_cost}
 

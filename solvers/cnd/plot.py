@@ -11,7 +11,7 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from nocl import store
+from nocl.support import store
 
 GAPS = {"gap_median": "median", "gap_p95": "95th percentile", "kicked_median": "median, kicked states",
         "kicked_p95": "95th percentile, kicked states", "held_median": "median, held controls"}

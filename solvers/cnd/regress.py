@@ -14,7 +14,7 @@ from torch import Tensor
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.cnd.labels import Labels
-from nocl.to_torch import to_torch
+from nocl.translate.torch_functions import to_torch
 
 Loss = Callable[[Tensor], Tensor]  # row numbers of the labels -> a scalar
 Report = Callable[[float], Any]  # told the loss of each iteration

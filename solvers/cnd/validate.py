@@ -7,14 +7,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from nocl.checks import Array
 from nocl.hjb import hjb_residual, rollout
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
-from nocl.solvers.bank import SolutionBank, extend
 from nocl.solvers.cnd.labels import SMALL, Field, answered, continuous_cost, kicked_states, tube_states
-from nocl.solvers.ddp import DDP, DDPSolution
-from nocl.to_torch import to_torch
+from nocl.solvers.ddp.bank import SolutionBank, extend
+from nocl.solvers.ddp.solver import DDP, DDPSolution
+from nocl.support.checks import Array
+from nocl.translate.torch_functions import to_torch
 
 NODES = 16  # of each solution at which the HJB residual is taken
 

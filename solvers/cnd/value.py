@@ -16,18 +16,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from nocl.checks import Array
-from nocl.kernels import NoCompilerError
 from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
-from nocl.solvers.bank import SolutionBank
 from nocl.solvers.cnd.features import features
 from nocl.solvers.cnd.labels import Field, answered, kicked_states, tube_states
+from nocl.solvers.cnd.loss_kernel import ValueKernel
 from nocl.solvers.cnd.regress import Loss
 from nocl.solvers.cnd.validate import refined
-from nocl.solvers.cnd.value_kernel import ValueKernel
-from nocl.solvers.ddp import DDP, DDPSolution
-from nocl.to_torch import to_torch
+from nocl.solvers.ddp.bank import SolutionBank
+from nocl.solvers.ddp.solver import DDP, DDPSolution
+from nocl.support.checks import Array
+from nocl.translate.kernels import NoCompilerError
+from nocl.translate.torch_functions import to_torch
 
 SMALL = 0.02  # of the median: labels below count as if they were that large in relative errors
 ROUND = 0.01  # relative errors above it count by their size, not their square: few labels are hard, or not global

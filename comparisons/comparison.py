@@ -1,0 +1,96 @@
+"""compare: any methods on the same initial states, one judge, one row a method and initial state. B is the batch.
+
+Fair by construction: every method gets the same states, and its controls are run on the exact f under CVODES with the
+cost as an extra state (nocl.simulate), whatever model, grid or integrator it used itself. `methods.py` has what a
+method may be, `judging.py` how its runs are spread over processes.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from nocl.comparisons.judging import Disturbance, Judgement, Judging, judge
+from nocl.comparisons.methods import Run, Solving, checked, is_count, rates_of, runs_of
+from nocl.comparisons.report.results import Judged, Report
+from nocl.ocp import OCP
+from nocl.support import checks
+from nocl.support.checks import Array
+
+
+def compare(ocp: OCP, methods: Mapping[str, Any], n: int = 100, x0: ArrayLike | None = None, seed: int = 1,
+            hold: int | Sequence[int | None] | None = None, workers: int | str = 1,
+            out: str | os.PathLike[str] | None = None, progress: bool | None = None) -> Report:
+    """Judge `methods` (by name) on the same initial states: x0 [nx] or [B, nx], else n drawn with `seed`.
+
+    Parameters
+    ----------
+    hold : rates of feedback: None, continuous; K, continuous and once more held on K intervals, as the method
+        "NAME (K holds)"; a list of these, [None, 80, 400], each
+    workers : 1, a number of processes, or "auto": processes where the measured cost of the first parts says that they
+        pay; or a Dask scheduler's "tcp://...". Solvers that take `workers` get it too
+    out : a folder that gets each part's outcome as soon as it is there: the same call resumes what is there. A plain
+        callable is known by its name: another one of that name needs another folder
+    progress : bars with the time left on stderr; default: where that is a terminal
+
+    Nothing is dropped: where a method raises, does not converge or blows up, its row says so. Milliseconds: a solver's
+    own `seconds` for that state (the whole control trajectory; without them, its wall time over the number of states);
+    for a controller the median time of one control evaluation there; for NMPC's loop those of its own solves.
+
+    Raises ValueError for methods that are none, or are made for another problem.
+    """
+    checks.problem(ocp, "compare")
+    states = initial_states(ocp, n, x0, seed)
+    rates, folder = rates_of(hold), None if out is None else Path(out)
+    start = time.perf_counter()
+    runs = runs_of(ocp, checked(methods), states, rates, Solving(workers, folder, progress))
+    job = Judging(ocp, states, runs, Disturbance(), [0.0] * len(runs))
+    judgements = judge(job, workers, None if folder is None else folder / "judged", progress, "judging")
+    judged = tuple(_judged(run, judgement, states) for run, judgement in zip(runs, judgements, strict=True))
+    settings = {"seed": seed if x0 is None else None, "n": len(states),
+                "hold": ", ".join("continuous" if rate is None else str(rate) for rate in rates),
+                "initial states": "given" if x0 is not None else f"drawn with seed {seed}"}
+    return Report(ocp, states, judged, settings, time.perf_counter() - start)
+
+
+def initial_states(ocp: OCP, n: int, x0: ArrayLike | None, seed: int) -> Array:
+    """The states [B, nx] that are meant."""
+    if x0 is None:
+        if not is_count(n):
+            raise ValueError(f"n is {n!r}; expected a number of initial states >= 1")
+        return ocp.initial_states.sample(int(n), seed)
+    rows = checks.states(x0, ocp.system.nx, ocp.system.name)[0].copy()
+    if not len(rows):
+        raise ValueError("x0 has no rows; expected at least one initial state")
+    return rows
+
+
+def _judged(run: Run, judgement: Judgement, x0: Array) -> Judged:
+    s, solved = judgement.simulation, run.solved
+    solves = np.ones(len(x0)) if solved is None else solved.solves
+    predicted = _predicted(run.method, x0) if solved is None else solved.predicted
+    return Judged(run.name, run.how, s, judgement.ms_first, judgement.ms_per_control, judgement.evaluations, solves,
+                  predicted, None if solved is None else solved.plan, _value(run.method, predicted))
+
+
+def _value(method: Any, predicted: Array) -> Any:
+    """The method's own value function, which the report draws slices of, where it answers."""
+    return method.value if hasattr(method, "value") and np.isfinite(predicted).any() else None
+
+
+def _predicted(method: Any, x0: Array) -> Array:
+    """The cost that the method itself expects, V(x0, 0), where it has a value function; else NaN."""
+    if hasattr(method, "value"):
+        try:
+            values = np.asarray(method.value(x0, 0.0), dtype=np.float64).ravel()
+        except Exception:  # a prediction that cannot be had is no failure of the controller
+            values = np.empty(0)
+        if len(values) == len(x0):
+            return values
+    return np.full(len(x0), np.nan)

@@ -1,0 +1,1 @@
+"""What a comparison found: rows, summary, sentences, tables, pictures, a page."""

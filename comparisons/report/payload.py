@@ -1,0 +1,269 @@
+"""What the page draws from: a Report as compact plain data, arrays in base64. B is the batch, M the methods.
+
+Runs are the bulk. Each (state, channel) of a method is kept at some times as 16-bit steps between its least and its
+greatest value, an error of at most 1 / 131068 of that range: far below a pixel. The page decodes them at a click.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Callable
+from itertools import combinations
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nocl.comparisons.report.explain import explained_method
+from nocl.comparisons.report.findings import MethodAudit, Rollouts
+from nocl.comparisons.report.results import Judged, Report
+from nocl.comparisons.report.tables import AUDITED
+from nocl.ocp import OCP
+from nocl.support.checks import Array
+
+NODES = {81: 1_500_000, 41: 2_500_000, 21: 3_700_000}  # times of a run, and the characters that all runs may take then
+ROLLOUTS = 1_500_000  # characters that the audits' rollouts may take: left out where they take more
+MISSING = 65535  # the 16-bit step that stands for NaN
+PAIRS = 6  # of coordinates that V is drawn over
+TIMES = (0.0, 0.5, 0.9)  # of the horizon that V is drawn at
+GRID = 41  # points of a slice of V in each direction
+OUTLINE = 121  # points of the grid that an obstacle's edge is found on, in each direction
+MARGIN = 0.15  # of what runs visit, about a slice
+
+
+def payload(report: Report) -> dict[str, Any]:
+    """All that the page's figures need, as JSON data."""
+    s, kept = report.ocp.system, kept_states(report)
+    nodes, states = kept
+    return {"name": s.name, "states": s.state_names, "controls": s.control_names,
+            "labels": [s.unit(name) for name in s.names], "horizon": report.ocp.horizon,
+            "goal": [*report.ocp.x_goal.tolist(), *report.ocp.u_goal.tolist()],
+            "lbu": s.lbu.tolist(), "ubu": s.ubu.tolist(), "explained": explained_method(report),
+            "B": len(report.x0), "x0": floats(report.x0), "gap": floats(report.gap),
+            "feasible": report.feasible.astype(int).tolist(),
+            "best": [_index(report, i) for i in range(len(report.x0))],
+            "methods": [_method(report, j, nodes, states) for j in report.judged],
+            "kept": None if len(states) == len(report.x0) else states.tolist(),
+            "plane": plane(report), "obstacles": obstacles(report), "slices": slices(report), **_study(report)}
+
+
+def floats(values: ArrayLike) -> str:
+    """Little-endian float32 in base64; NaN and inf stay."""
+    return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode()
+
+
+def kept_states(report: Report) -> tuple[int, NDArray[np.integer[Any]]]:
+    """(nodes, states) whose runs fit into the page: all states if they can, else the worst and an even choice."""
+    channels = _channels(report)
+    size = len(report.judged) * channels * 2 * 4 / 3  # characters of one state at one node
+    for nodes, budget in NODES.items():
+        if len(report.x0) * (nodes + 4) * size <= budget:
+            return nodes, np.arange(len(report.x0))
+    n = max(1, int(budget / ((nodes + 4) * size)))
+    order = np.argsort(-report.gap[explained_method(report)], kind="stable")
+    even = np.linspace(0, len(order) - 1, n - n // 4).astype(int)
+    return nodes, np.unique(np.r_[order[: n // 4], order[even]])
+
+
+def _channels(report: Report) -> int:
+    """States, controls, cost to go, and V along the run where a method has one."""
+    return report.ocp.system.nx + report.ocp.system.nu + 1 + (valued(report) is not None)
+
+
+def valued(report: Report) -> Judged | None:
+    """The first method with a value function."""
+    return next((j for j in report.judged if j.value is not None), None)
+
+
+def _index(report: Report, i: int) -> int:
+    """Who found the best known cost, -1 where nobody did."""
+    names = [j.name for j in report.judged]
+    return names.index(report.best_method[i]) if report.best_method[i] else -1
+
+
+def _method(report: Report, j: Judged, nodes: int, states: NDArray[np.integer[Any]]) -> dict[str, Any]:
+    s = j.simulation
+    index = np.unique(np.rint(np.linspace(0, len(s.t) - 1, min(nodes, len(s.t)))).astype(int))
+    channels = [s.x[states], s.u[states], cost_to_go(report.ocp, j)[states, :, None]]
+    run = np.concatenate([c[:, index] for c in channels], axis=2)
+    if (owner := valued(report)) is not None:
+        run = np.concatenate([run, values_along(owner, s.t[index], s.x[states][:, index])[..., None]], axis=2)
+    numbers = np.stack([s.cost, s.running_cost, s.terminal_cost, s.terminal_error, s.saturation, s.clearance,
+                        j.ms_first, j.ms_per_control], axis=1)
+    failed = {str(i): str(s.message[i]) for i in np.flatnonzero(~np.asarray(s.success, dtype=bool))}
+    return {"name": j.name, "how": j.how, "held": "held" in j.how, "t": s.t[index].tolist(), "failed": failed,
+            "numbers": floats(numbers), **quantised(run)}
+
+
+def quantised(run: Array) -> dict[str, str]:
+    """[n, K, channels] as 16-bit steps of each (state, channel) and their limits [n, channels, 2]."""
+    run = np.where(np.isfinite(run), run, np.nan)
+    missing = np.isnan(run)
+    low = np.where(missing, np.inf, run).min(axis=1, keepdims=True)
+    high = np.where(missing, -np.inf, run).max(axis=1, keepdims=True)
+    low, high = (np.where(np.isfinite(v), v, 0.0).astype("<f4").astype(float) for v in (low, high))
+    width = np.where(high > low, high - low, 1.0)
+    steps = np.clip(np.rint((run - low) / width * (MISSING - 1)), 0, MISSING - 1)
+    whole = np.where(missing, MISSING, steps).astype("<u2")
+    return {"runs": base64.b64encode(whole.tobytes()).decode(),
+            "limits": floats(np.stack([low[:, 0], high[:, 0]], axis=-1))}
+
+
+def cost_to_go(ocp: OCP, j: Judged) -> Array:
+    """[B, K+1], what a run still costs at its nodes: L by trapezoids, scaled so that it starts at the judged cost."""
+    s, held = j.simulation, "held" in j.how
+    end = s.u[:, :-1] if held else s.u[:, 1:]
+    steps = 0.5 * np.diff(s.t) * (_running(ocp, s.x[:, :-1], s.u[:, :-1]) + _running(ocp, s.x[:, 1:], end))
+    total = steps.sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        steps = steps * np.where(np.abs(total) > 0, s.running_cost / total, 1.0)[:, None]
+        left = np.c_[np.cumsum(steps[:, ::-1], axis=1)[:, ::-1], np.zeros(len(steps))]
+        return np.asarray(left + s.terminal_cost[:, None])
+
+
+def _running(ocp: OCP, x: Array, u: Array) -> Array:
+    """[B, K], L at x [B, K, nx], u [B, K, nu]."""
+    flat = ocp.L(x.reshape(-1, x.shape[2]).T, u.reshape(-1, u.shape[2]).T).full()
+    return flat.reshape(x.shape[:2])
+
+
+def values_along(owner: Judged, t: Array, x: Array) -> Array:
+    """[n, K], the owner's V along the runs x [n, K, nx]."""
+    return np.stack([_values(owner, x[:, k], float(t[k])) for k in range(len(t))], axis=1)
+
+
+def _values(owner: Judged, x: Array, t: float) -> Array:
+    """[n], V(x, t), NaN where x is not finite."""
+    known = np.isfinite(x).all(axis=1)
+    V = np.full(len(x), np.nan)
+    if owner.value is not None and known.any():
+        V[known] = np.asarray(owner.value(x[known], t), dtype=float).reshape(-1)
+    return V
+
+
+def plane(report: Report) -> list[int]:
+    """The two coordinates (of states, then controls) of a phase portrait: an obstacle's, or a state and its rate."""
+    for pair in _obstacle_pairs(report.ocp):
+        return list(pair)
+    s, moved = report.ocp.system, _moved(report)
+    if s.nx == 1:
+        return [0, 1]
+    pairs = [] if s.xdot is None else [(i, k) for i in range(s.nx) for k in range(s.nx) if i != k
+                                       and ca.is_equal(s.xdot[i], s.x[k], 0)]
+    best = max(pairs, key=lambda pair: moved[pair[0]], default=None)
+    return list(best) if best else sorted(np.argsort(-moved, kind="stable")[:2].tolist())
+
+
+def _moved(report: Report) -> Array:
+    """[nx], what each coordinate moves by along the runs, as a share of its box."""
+    spans = []
+    for j in report.judged:
+        x = j.simulation.x[np.isfinite(j.simulation.x).all(axis=(1, 2))]
+        if len(x):
+            spans.append(np.median(np.ptp(x, axis=1), axis=0))
+    s = report.ocp.system
+    return np.max(spans, axis=0) / (s.ubx - s.lbx) if spans else np.zeros(s.nx)
+
+
+def visited(report: Report) -> tuple[Array, Array]:
+    """(lower, upper) [nx] of the states that runs visit, without the outermost hundredths."""
+    x = np.concatenate([j.simulation.x.reshape(-1, report.ocp.system.nx) for j in report.judged])
+    x = x[np.isfinite(x).all(axis=1)]
+    x = np.concatenate([x, report.x0, report.ocp.x_goal[None]])
+    low, high = np.percentile(x, [0.5, 99.5], axis=0)
+    low, high = np.minimum(low, report.ocp.x_goal), np.maximum(high, report.ocp.x_goal)
+    room = MARGIN * np.where(high > low, high - low, 1.0)
+    return low - room, high + room
+
+
+def _obstacle_pairs(ocp: OCP) -> dict[tuple[int, int], list[int]]:
+    """Path constraints by the two coordinates that they depend on, where it is two."""
+    pairs: dict[tuple[int, int], list[int]] = {}
+    for c, h in enumerate(ocp.path_constraints.values()):
+        on = [k for k in range(ocp.system.nx) if ca.depends_on(h, ocp.system.x[k])]
+        if len(on) == 2:
+            pairs.setdefault((on[0], on[1]), []).append(c)
+    return pairs
+
+
+def obstacles(report: Report) -> list[dict[str, Any]]:
+    """The edges of path constraints that depend on two coordinates: min h on a grid of them."""
+    low, high = visited(report)
+    found = []
+    for (i, k), which in _obstacle_pairs(report.ocp).items():
+        x = np.tile(report.ocp.x_goal, (OUTLINE**2, 1))
+        x[:, i], x[:, k] = (v.ravel() for v in np.meshgrid(*(np.linspace(low[c], high[c], OUTLINE) for c in (i, k))))
+        h = report.ocp.h(x.T).full()[which].min(axis=0)
+        found.append({"i": i, "k": k, "x": [low[i], high[i]], "y": [low[k], high[k]], "n": OUTLINE, "h": floats(h)})
+    return found
+
+
+def slices(report: Report) -> dict[str, Any] | None:
+    """V over pairs of coordinates at some times, the others as in the median run; None without a value function."""
+    owner = valued(report)
+    if owner is None:
+        return None
+    s, moved = owner.simulation, _moved(report)
+    low, high = visited(report)
+    most = np.argsort(-moved, kind="stable")[:4].tolist()
+    first = [k for k in plane(report) if k < report.ocp.system.nx]
+    pairs = ([tuple(first)] if len(first) == 2 else []) + list(combinations(sorted(most), 2))
+    pairs = list(dict.fromkeys(pairs))[:PAIRS]
+    nodes = [int(np.rint(share * (len(s.t) - 1))) for share in TIMES]
+    ok = np.isfinite(s.x).all(axis=(1, 2))
+    if not pairs or not ok.any():
+        return None
+    base = [np.median(s.x[ok, k], axis=0) for k in nodes]
+    V = [[_slice(owner, b, pair, low, high, float(s.t[k])) for b, k in zip(base, nodes, strict=True)]
+         for pair in pairs]
+    return {"method": owner.name, "pairs": [[int(k) for k in pair] for pair in pairs],
+            "t": [float(s.t[k]) for k in nodes], "n": GRID, "base": np.array(base).tolist(), "low": low.tolist(),
+            "high": high.tolist(), "V": floats(np.array(V))}
+
+
+def _slice(owner: Judged, base: Array, pair: tuple[int, ...], low: Array, high: Array, t: float) -> Array:
+    """[GRID, GRID] of V, the second coordinate down the rows."""
+    x = np.tile(base, (GRID**2, 1))
+    i, k = pair
+    x[:, i], x[:, k] = (v.ravel() for v in np.meshgrid(*(np.linspace(low[c], high[c], GRID) for c in (i, k))))
+    return _values(owner, x, t).reshape(GRID, GRID)
+
+
+def _rollout_nodes(report: Report) -> int:
+    """Times that the audits' rollouts are kept at: all of them fit, or 0."""
+    runs = sum(len(audit.rollouts) for audit in report.audits) * len(report.x0)
+    fits = (nodes for nodes in NODES if runs * (nodes + 4) * report.ocp.system.nx * 2 * 4 / 3 <= ROLLOUTS)
+    return next(fits, 0)
+
+
+def _rollout(rollout: Rollouts, nodes: int) -> dict[str, Any]:
+    index = np.unique(np.rint(np.linspace(0, len(rollout.t) - 1, min(nodes, len(rollout.t)))).astype(int))
+    return {"name": rollout.name, "t": rollout.t[index].tolist(), **quantised(rollout.x[:, index])}
+
+
+def _audit(audit: MethodAudit, nodes: int) -> dict[str, Any]:
+    """What an audit says of each state, by the names that rows have, in the words of the table of audits."""
+    rows, words = audit.rows(), dict(AUDITED)
+    keys = [key for key in rows[0] if any(not math.isnan(row[key]) for row in rows)]
+    return {"method": audit.method, "keys": [words.get(key, key) for key in keys],
+            "values": floats([[row[key] for key in keys] for row in rows]),
+            "rollouts": [_rollout(rollout, nodes) for rollout in audit.rollouts] if nodes else []}
+
+
+def _study(report: Report) -> dict[str, Any]:
+    """What a study found beyond costs, where it did."""
+    parts: list[tuple[str, Callable[[], Any]]] = [
+        ("audits", lambda: [_audit(audit, _rollout_nodes(report)) for audit in report.audits]),
+        ("robustness", lambda: [] if report.robustness is None else [
+            {"name": s.name, "losses": [{"method": x.method, "lost": floats(x.lost)} for x in s.losses]}
+            for s in report.robustness.scenarios]),
+        ("stability", lambda: [
+            {"method": s.method, "where": s.where, "re": floats(s.eigenvalues.real), "im": floats(s.eigenvalues.imag)}
+            for s in report.stability]),
+        ("regions", lambda: [
+            {"method": r.method, "within": r.within, "scale": r.scale.tolist(), "n": r.n,
+             "share": (r.successes / r.n).tolist(), "lower": r.lower.tolist(), "upper": r.upper.tolist(),
+             "x0": floats(r.x0), "success": r.success.astype(int).ravel().tolist()} for r in report.regions])]
+    return {name: make() for name, make in parts}

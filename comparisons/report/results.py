@@ -1,0 +1,302 @@
+"""Report: what a comparison found, as rows, a summary, a verdict and files. Gaps and shares are in per cent."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+import textwrap
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from nocl.comparisons.report.findings import (
+    COST_FLOOR,
+    MethodAudit,
+    Promise,
+    Region,
+    Robustness,
+    Row,
+    Stability,
+    percentile,
+)
+from nocl.judge import Simulation
+from nocl.ocp import OCP
+from nocl.support.checks import Array
+
+REFERENCE = "reference"  # the name of a yardstick among the methods: its speed is no method's
+VIOLATION = 1e-3  # a path constraint below minus this, in its own unit, is violated
+OPEN_LOOP = "open loop"  # how a plan's control was run
+WIDTH = 118  # characters of a line in the terminal
+Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A solver's own trajectory and costate, at the K+1 nodes of its run; NaN where it has none."""
+
+    x: Array  # [B, K+1, nx]
+    costate: Array  # [B, K+1, nx]
+
+
+@dataclass(frozen=True, eq=False)
+class Judged:
+    """One method on all B initial states, as the judge saw it."""
+
+    name: str
+    how: str  # how its control was run
+    simulation: Simulation
+    ms_first: Array  # [B], milliseconds to the first control: a solve, or one evaluation of a controller
+    ms_per_control: Array  # [B], milliseconds for each later control; NaN in open loop, where none is computed
+    evaluations: Array  # [B], of f with its derivatives, by which the controls were computed; NaN where unknown
+    solves: Array  # [B], solves that `ms_first` went into: several starts, neighbours; 1 for a controller
+    predicted: Array  # [B], the cost that the method itself expected, NaN where it has no opinion
+    plan: Plan | None = None  # what a solver planned
+    value: Callable[[Array, float], Array] | None = None  # (x [B, nx], t) -> V [B], where it has one
+
+    @property
+    def feasible(self) -> Mask:
+        """[B], whether the run reached the horizon with all path constraints held."""
+        return np.asarray(self.simulation.success, dtype=bool) & ~(self.simulation.clearance < -VIOLATION)
+
+
+class Summary(list[Row]):
+    """One dict a method; printed as a table."""
+
+    def __str__(self) -> str:
+        return text_table([label for label, _, _ in COLUMNS], [cells(row) for row in self])
+
+    __repr__ = __str__
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Report:
+    """Any methods on the same B initial states of a problem; `rows`, `summary` and `verdict` are read from `judged`.
+
+    What a study finds beyond costs stands in the other fields, empty where it was not asked for.
+    """
+
+    ocp: OCP
+    x0: Array  # [B, nx]
+    judged: tuple[Judged, ...]
+    settings: Mapping[str, Any]
+    seconds: float  # wall time of the comparison
+    audits: tuple[MethodAudit, ...] = ()  # of methods by name: models and integrators, values
+    robustness: Robustness | None = None
+    promises: tuple[Promise, ...] = ()  # one a method, where the states are independent draws
+    stability: tuple[Stability, ...] = ()
+    regions: tuple[Region, ...] = ()
+
+    def rows(self) -> list[Row]:
+        """One dict a method and initial state; a run that failed has success False, its message, and infinite cost."""
+        audits = {audit.method: audit.rows() for audit in self.audits}
+        keys = list(dict.fromkeys(key for rows in audits.values() for key in rows[0]))
+        return [self._row(m, i) | dict.fromkeys(keys, math.nan) | (audits[j.name][i] if j.name in audits else {})
+                for m, j in enumerate(self.judged) for i in range(len(self.x0))]
+
+    def summary(self) -> Summary:
+        """One dict a method. Means are over the runs that did not fail; medians, percentiles and shares over all."""
+        return Summary(self._summarize(m) for m in range(len(self.judged)))
+
+    def verdict(self) -> list[str]:
+        """What the numbers say, in a few sentences."""
+        from nocl.comparisons.report.verdict import verdict
+
+        return verdict(self)
+
+    @cached_property
+    def cost(self) -> Array:
+        """[methods, B] judged costs, inf where a run failed."""
+        return np.array([j.simulation.cost for j in self.judged])
+
+    @cached_property
+    def feasible(self) -> Mask:
+        """[methods, B]"""
+        return np.array([j.feasible for j in self.judged])
+
+    @cached_property
+    def best(self) -> Array:
+        """[B], the least judged cost of a run that violated nothing; NaN where there is none."""
+        least = np.where(self.feasible, self.cost, np.inf).min(axis=0)
+        return np.where(np.isfinite(least), least, np.nan)
+
+    @cached_property
+    def best_method(self) -> list[str]:
+        """[B], who found it ("" where nobody did); the first named where two are equal."""
+        who = np.where(self.feasible, self.cost, np.inf).argmin(axis=0)
+        return [self.judged[m].name if math.isfinite(b) else "" for m, b in zip(who, self.best, strict=True)]
+
+    @cached_property
+    def gap(self) -> Array:
+        """[methods, B], 100 (cost - best) / max(|best|, COST_FLOOR); inf where a run failed or nobody has a best."""
+        gap = 100 * (self.cost - self.best) / np.maximum(np.abs(self.best), COST_FLOOR)
+        return np.where(np.isnan(gap), np.inf, gap)
+
+    def within(self, percent: float) -> Mask:
+        """[methods, B], whether a run violates nothing and is within so much of the best known cost."""
+        return np.asarray(self.feasible & (self.gap <= percent), dtype=bool)
+
+    def _row(self, m: int, i: int) -> Row:
+        j, s = self.judged[m], self.judged[m].simulation
+        return {"method": j.name, "state": i, "x0": self.x0[i].tolist(), "success": bool(s.success[i]),
+                "feasible": bool(self.feasible[m, i]), "message": s.message[i], "cost": float(s.cost[i]),
+                "gap": float(self.gap[m, i]), "best_cost": float(self.best[i]), "best_method": self.best_method[i],
+                "predicted_cost": float(j.predicted[i]), "running_cost": float(s.running_cost[i]),
+                "terminal_cost": float(s.terminal_cost[i]), "terminal_error": float(s.terminal_error[i]),
+                "x_end": s.x[i, -1].tolist(), "error": (s.x[i, -1] - self.ocp.x_goal).tolist(),
+                "control_magnitude": float(s.control_magnitude[i]),
+                "saturation": float(s.saturation[i]), "clearance": float(s.clearance[i]),
+                "ms_first": float(j.ms_first[i]), "solves": int(j.solves[i]),
+                "ms_per_control": float(j.ms_per_control[i]), "evaluations": float(j.evaluations[i])}
+
+    def _summarize(self, m: int) -> Row:
+        j, s, gap = self.judged[m], self.judged[m].simulation, self.gap[m]
+        ok = np.asarray(s.success, dtype=bool)
+        return {"method": j.name, "how": j.how, "n": len(self.x0), "failures": int((~ok).sum()),
+                "violations": int((ok & ~self.feasible[m]).sum()),
+                "cost_mean": mean(s.cost[ok]), "cost_median": float(np.median(s.cost)),
+                "predicted_mean": mean(j.predicted[ok]),
+                "gap_median": percentile(gap, 50), "gap_p95": percentile(gap, 95),
+                "within_1": 100 * float(self.within(1).mean(axis=1)[m]),
+                "within_5": 100 * float(self.within(5).mean(axis=1)[m]),
+                "found_best": self.best_method.count(j.name),
+                "terminal_error_mean": mean(s.terminal_error[ok]),
+                "terminal_error_sd": float(s.terminal_error[ok].std()) if ok.any() else math.nan,
+                "control_magnitude": mean(s.control_magnitude[ok]), "saturation": mean(s.saturation[ok]),
+                "clearance_min": float(np.min(s.clearance[ok], initial=math.inf)),
+                "ms_first": mean(j.ms_first), "solves": mean(j.solves), "ms_per_solve": mean(_each_answer(j)),
+                "ms_per_control": mean(j.ms_per_control)}
+
+    def save(self, folder: str | Path, animation: bool | None = None, draw: Any = None) -> Path:
+        """Write report.html and its companions (files.py lists them) into the folder; return the path of report.html.
+
+        A report that stands there is replaced, file by file and each atomically; other files stay.
+
+        Parameters
+        ----------
+        animation : whether to make animation.gif, of the first two methods side by side; default: up to 200 states
+        draw : how the system is drawn there: see nocl.comparisons.animate
+        """
+        from nocl.comparisons.report.files import write_report  # matplotlib is imported where pictures are drawn
+
+        return write_report(self, Path(folder), animation, draw)
+
+    def __str__(self) -> str:
+        what = f"{self.ocp.system.name}, {count(len(self.x0), 'initial state')} {self.settings['initial states']}"
+        said = [textwrap.fill(sentence, WIDTH, subsequent_indent="  ") for sentence in self.verdict()]
+        promised = [textwrap.fill(str(promise), WIDTH, subsequent_indent="  ") for promise in self.promises]
+        return "\n".join([what, "", str(self.summary()), "", *NOTE, "", *self._disturbed(), *promised, *said])
+
+    def _disturbed(self) -> list[str]:
+        """Medians and 95th percentiles of what disturbances cost, as a table in plain text."""
+        if self.robustness is None:
+            return []
+        scenarios = self.robustness.scenarios
+        body = [[s.name, *(f"{_loss(one.lost, 50)} / {_loss(one.lost, 95)}" for one in s.losses)] for s in scenarios]
+        head = ["cost lost %, median / p95", *(one.method for one in scenarios[0].losses)]
+        return [text_table(head, body), ""]
+
+    __repr__ = __str__
+
+
+def _loss(lost: Array, q: float) -> str:
+    known = lost[~np.isnan(lost)]
+    return percent(percentile(known, q)) if known.size else "-"
+
+
+def _each_answer(judged: Judged) -> Array:
+    """[B], milliseconds for one answer: a control of a controller's, or one of the solves of a solver."""
+    feedback = ~np.isnan(judged.ms_per_control)
+    return np.where(feedback, judged.ms_per_control, judged.ms_first / judged.solves)
+
+
+def mean(values: Array) -> float:
+    """Of what is no NaN; NaN of nothing."""
+    known = values[~np.isnan(values)]
+    return float(known.mean()) if known.size else math.nan
+
+
+# label, key(s) that the cell is made of, how it is written
+COLUMNS: tuple[tuple[str, str, str], ...] = (
+    ("method", "method", "text"), ("failed", "failures", "count"), ("mean cost", "cost_mean", "number"),
+    ("predicted", "predicted_mean", "number"),
+    ("median gap %", "gap_median", "percent"), ("p95 gap %", "gap_p95", "percent"),
+    ("within 1 %", "within_1", "share"), ("within 5 %", "within_5", "share"),
+    ("terminal error", "terminal_error", "spread"), ("mean |u|", "control_magnitude", "number"),
+    ("ms", "ms_per_solve", "number"),
+    ("solves", "solves", "number"))
+NOTE = (
+    "Judged on the exact f under CVODES. Gap: to the best known cost of the same initial state, over all methods here.",
+    "ms: one evaluation of a controller, or one solve; a solver that tried several starts took so many solves a state.",
+    "Mean costs, error and |u| are over the runs that did not fail; predicted is what the method itself expected.")
+
+
+def cells(row: Row) -> list[str]:
+    """A summary row as text, one cell a column."""
+    return [_cell(row, key, form) for _, key, form in COLUMNS]
+
+
+def _cell(row: Row, key: str, form: str) -> str:
+    match form:
+        case "text" | "count":
+            return str(row[key])
+        case "share":
+            return f"{row[key]:.0f} %" if row[key] in (0, 100) else f"{row[key]:.1f} %"
+        case "percent":
+            return percent(row[key])
+        case "spread":
+            return f"{number(row[key + '_mean'])} ± {number(row[key + '_sd'])}"
+    return number(row[key])
+
+
+def number(value: float) -> str:
+    """Three or four digits, '-' for NaN."""
+    if math.isnan(value):
+        return "-"
+    return f"{value:.3g}" if abs(value) < 1e-3 or abs(value) >= 1e4 else f"{value:.4g}"
+
+
+def percent(value: float) -> str:
+    """A gap with the digits that matter, without its sign of per cent."""
+    if not math.isfinite(value):
+        return "failed"
+    return f"{value:.0f}" if abs(value) >= 100 else f"{value:.1f}" if abs(value) >= 10 else f"{value:.2f}"
+
+
+def text_table(head: Sequence[str], body: Iterable[Sequence[str]]) -> str:
+    """A table in plain text: the first column to the left, numbers to the right."""
+    lines = [list(head), *map(list, body)]
+    widths = [max(len(line[c]) for line in lines) for c in range(len(head))]
+    text = ["  ".join(cell.ljust(w) if c == 0 else cell.rjust(w)
+                      for c, (cell, w) in enumerate(zip(line, widths, strict=True))).rstrip() for line in lines]
+    return "\n".join([text[0], "  ".join("-" * w for w in widths), *text[1:]])
+
+
+def count(k: int, what: str) -> str:
+    """Like '1 interval' or '2 intervals'."""
+    return f"{k} {what}" + ("" if k == 1 else "s")
+
+
+def flat_rows(report: Report) -> list[Row]:
+    """The rows with one column a coordinate: x0 as x0_NAME, x_end as end_NAME, x_end - x* as error_NAME."""
+    names = report.ocp.system.state_names
+    flat = []
+    for row in report.rows():
+        for key, short in (("x0", "x0"), ("x_end", "end"), ("error", "error")):
+            row |= {f"{short}_{name}": v for name, v in zip(names, row.pop(key), strict=True)}
+        flat.append(row)
+    return flat
+
+
+def csv_text(rows: Sequence[Row]) -> str:
+    """Rows as CSV; numbers in full, so that they come back bit by bit."""
+    file = io.StringIO()
+    writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return file.getvalue()

@@ -1,0 +1,276 @@
+"""The main job's stages in a run's folder, for the command line: each is made once, and taken up where it stands.
+
+dynamics/   the learned dynamics                              cnd/      controller and value function, training.png
+export/     *.casadi, c/, c_float32/, parity.json             report/   report.html, rows.csv, summary.json, figures/
+checkpoint/ what an interrupted stage goes on from; gone once it is finished
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import shutil
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from nocl import __version__
+from nocl.ocp import OCP
+from nocl.solvers.cnd import CND, TrainSettings, train
+from nocl.support import store
+from nocl.support.compiler import fingerprint
+from nocl.sysid.identification import LearnedDynamics, LogSettings, Settings, identify
+from nocl.sysid.logs.log import Log
+
+QUICK_IDENTIFY = Settings(iterations=300, polish=10)
+QUICK_LOG = LogSettings(width=12, iterations=60, steps=3, window=20)
+QUICK_TRAIN = TrainSettings(seeds=6, starts=6, states=60, tails=300, visits=200, rounds=1, iterations=400,
+                            value_tails=400, value_visits=200, value_iterations=300, held_out=16)
+PARTS = ("dynamics", "cnd", "export", "report", "checkpoint")  # folders in a run's folder
+KEY = "run"  # of a card: what the stage was made from
+
+
+@dataclass(frozen=True)
+class Stages:
+    """The stages of one problem in one folder; what was made with other settings there is made anew, and said so."""
+
+    ocp: OCP
+    folder: Path
+    seed: int
+    quick: bool
+
+    def check(self, exact: bool) -> None:
+        """ValueError where the folder holds something that is not a run's, before any work."""
+        for part in PARTS:
+            if (self.folder / part).exists() and not (self.folder / part).is_dir():
+                raise ValueError(f"{self.folder / part} is a file; expected a run's folder: name another --out")
+        if not exact:
+            self._dynamics_there()
+        self._cnd_there()
+
+    def identify(self) -> LearnedDynamics:
+        """The learned dynamics, in dynamics/."""
+        made_from, there = self._made_from(), self._dynamics_there()
+        if there is not None and (there.card[KEY] == made_from or _of_a_log(there, made_from)):
+            say(f"dynamics: taken from {self.folder / 'dynamics'} ({there.card.get('score', '')})")
+            return there
+        say(f"dynamics: learning f of {self.ocp.system.name}" + _anew(there))
+        start = time.perf_counter()
+        checkpoint = self.folder / "checkpoint" / "dynamics"
+        model = identify(self.ocp.system, seed=self.seed, settings=QUICK_IDENTIFY if self.quick else None,
+                         checkpoint=checkpoint)
+        model = replace(model, card={**model.card, KEY: made_from})
+        model.save(self.folder / "dynamics")
+        _forget(checkpoint)
+        say(f"dynamics: {model.card.get('score', 'done')}, {time.perf_counter() - start:.0f} s")
+        return model
+
+    def identify_log(self, path: Path) -> LearnedDynamics:
+        """The dynamics learned from a log, in dynamics/; their errors on a fifth of its recordings are shown first."""
+        log = Log.read(path, self.ocp.system)
+        made_from, there = self._made_from(data=hashlib.sha256(path.read_bytes()).hexdigest()), self._dynamics_there()
+        if there is not None and there.card[KEY] == made_from:
+            say(f"dynamics: taken from {self.folder / 'dynamics'} ({there.card['score']})")
+            return there
+        say(f"dynamics: {log!r}" + _anew(there))
+        settings = QUICK_LOG if self.quick else None
+        start = time.perf_counter()
+        model = identify(self.ocp.system, data=log, seed=self.seed, settings=settings)
+        if len({r.run for r in log}) > 1:
+            train, test = log.split(seed=self.seed)
+            held = identify(self.ocp.system, data=train, seed=self.seed, settings=settings)
+            say(f"learned from four fifths of the recordings, simulated on the others:\n{held.validate(test)}")
+        outside = int(model.outside(fresh_states(self.ocp, 100, self.seed)).sum())
+        if outside:
+            say(f"{outside} of 100 initial states of the problem lie outside the log: the model guesses there")
+        model = replace(model, card={**model.card, KEY: made_from})
+        model.save(self.folder / "dynamics")
+        say(f"dynamics: {model.card['score']}, {time.perf_counter() - start:.0f} s, in {self.folder / 'dynamics'}")
+        return model
+
+    def train(self, exact: bool) -> CND:
+        """The controller and value function, in cnd/; on dynamics/ unless exact."""
+        model = None if exact else self.identify()
+        data = {} if model is None else {k: v for k, v in model.card[KEY].items() if k == "data"}
+        made_from, there = self._made_from(exact=exact, **data), self._cnd_there()
+        if there is not None and there.card.get(KEY) == made_from:
+            say(f"controller: taken from {self.folder / 'cnd'}")
+            return there
+        say(f"controller: training on {'the exact' if exact else 'learned'} dynamics" + _anew(there))
+        start = time.perf_counter()
+        checkpoint = self.folder / "checkpoint" / "cnd"
+        cnd = train(self.ocp, model, seed=self.seed, settings=QUICK_TRAIN if self.quick else None, out=checkpoint)
+        cnd.card[KEY] = made_from
+        cnd.save(self.folder / "cnd")
+        cnd.plot_training(self.folder / "cnd" / "training.png")
+        _forget(checkpoint)
+        say(f"controller: done, {time.perf_counter() - start:.0f} s")
+        return cnd
+
+    def export(self, cnd: CND, out: Path, forms: Sequence[str], against: Sequence[str] | None) -> None:
+        """Controller, value function and, where there are any, learned dynamics, with the proof of parity."""
+        from nocl.exports.bundle import export
+
+        start = time.perf_counter()
+        model = self._dynamics_there() if cnd.card.get("dynamics") == "learned" else None
+        say(f"export: {', '.join(forms)} to {out}")
+        certificate = export([cnd] if model is None else [cnd, model], out, forms, against=against)
+        say(f"export: {certificate}, {time.perf_counter() - start:.1f} s")
+
+    def compare(self, cnd: CND, out: Path, methods: Sequence[str], n: int, intervals: int,
+                hold: Sequence[int | None] | None = None, robust: bool = False) -> None:
+        """Study the methods on n fresh initial states, save the report and print its summary and verdict."""
+        from nocl.comparisons import study
+        from nocl.comparisons.disturbances import mass_variants
+
+        chosen = {name: cnd if name == "CND" else method(self.ocp, name, intervals) for name in methods}
+        model = self._dynamics_there() if cnd.card.get("dynamics") == "learned" else None
+        checkpoint = self._checkpoint(methods=list(methods), n=n, intervals=intervals, hold=str(hold), robust=robust,
+                                      controller=fingerprint(cnd.to_casadi()))
+        say(f"comparing {', '.join(methods)} on {n} initial states, on the exact dynamics")
+        report = study(self.ocp, chosen, n=n, seed=fresh_seed(self.seed), hold=hold, model=model, robust=robust,
+                       variants=mass_variants(self.ocp) if robust else None, out=checkpoint)
+        path = report.save(out)
+        _forget(checkpoint)
+        say(f"\n{report}\n\nreport: {path}")
+
+    def _made_from(self, **settings: Any) -> dict[str, Any]:
+        problem = hashlib.sha256(json.dumps(self.ocp.to_data(), sort_keys=True).encode()).hexdigest()
+        return {"problem": problem, "seed": self.seed, "quick": self.quick, **settings}
+
+    def _checkpoint(self, **settings: Any) -> Path:
+        """Where outcomes so far are kept while a comparison lasts: another one goes elsewhere."""
+        key = json.dumps([self._made_from(**settings), __version__, version("casadi")], sort_keys=True)
+        return self.folder / "checkpoint" / f"compare-{hashlib.sha256(key.encode()).hexdigest()[:12]}"
+
+    def _dynamics_there(self) -> LearnedDynamics | None:
+        folder = self.folder / "dynamics"
+        return _ours(LearnedDynamics.load(folder), folder) if _has_record(folder) else None
+
+    def _cnd_there(self) -> CND | None:
+        folder = self.folder / "cnd"
+        return _ours(CND.load(folder), folder) if _has_record(folder) else None
+
+
+def _has_record(folder: Path) -> bool:
+    return folder.exists() and (not folder.is_dir() or any(folder.glob("*" + store.SUFFIX)))
+
+
+def _ours(thing: Any, folder: Path) -> Any:
+    if KEY not in thing.card:
+        raise ValueError(f"{folder} holds what `nocl run` did not make, and would be overwritten; expected a folder of "
+                         "a run: name another --out")
+    return thing
+
+
+def _of_a_log(model: LearnedDynamics, made_from: dict[str, Any]) -> bool:
+    """Whether a model was learned from a log for the same problem: it stays, until another log is given."""
+    return "data" in model.card[KEY] and model.card[KEY]["problem"] == made_from["problem"]
+
+
+def _anew(there: Any) -> str:
+    """Why something that stands there is made again."""
+    return "" if there is None else " (what is there was made for another problem, seed or setting)"
+
+
+def _forget(checkpoint: Path) -> None:
+    """Remove the checkpoint of a finished stage."""
+    shutil.rmtree(checkpoint, ignore_errors=True)
+    if checkpoint.parent.is_dir() and not any(checkpoint.parent.iterdir()):
+        checkpoint.parent.rmdir()
+
+
+def say(text: str) -> None:
+    """A line for the user, at once."""
+    print(text, flush=True)
+
+
+def fresh_seed(seed: int) -> int:
+    """The seed of the initial states that methods are compared on: not the one that training draws from."""
+    return seed + 1
+
+
+def fresh_states(ocp: OCP, n: int, seed: int) -> np.ndarray[Any, np.dtype[np.float64]]:
+    """The initial states [n, nx] that methods are compared on."""
+    return ocp.initial_states.sample(n, fresh_seed(seed))
+
+
+def load_run(folder: Path) -> CND:
+    """The controller of a run's folder, or of a folder that CND.save wrote."""
+    if not folder.is_dir():
+        raise ValueError(f"there is no folder {folder}; expected one that `nocl run` or `nocl train` made")
+    return CND.load(folder / "cnd" if (folder / "cnd").is_dir() else folder)
+
+
+def method(ocp: OCP, name: str, intervals: int) -> Any:
+    """A method of the comparison other than CND, by name."""
+    from nocl import solvers
+    from nocl.solvers.ddp.global_search import GlobalDDP
+
+    match name.upper():
+        case "NMPC":
+            return solvers.NMPC(ocp, intervals=intervals)
+        case "NMPC-LOOP":
+            return solvers.NMPC(ocp, intervals=intervals).controller()
+        case "DDP":
+            return GlobalDDP(solvers.DDP(ocp, intervals=intervals))
+        case "LQR":
+            return solvers.LQR(ocp)
+    raise ValueError(f"method is {name!r}; expected NMPC, NMPC-LOOP, DDP or LQR")
+
+
+def solve(ocp: OCP, out: Path, name: str, n: int, seed: int, intervals: int, workers: int | str = "auto") -> None:
+    """Solve n initial states by one solver, and write OUT/NAME.npz (arrays), .json (messages) and a line of summary.
+
+    What is solved is kept in OUT/checkpoint until all is: the same call goes on from there.
+    """
+    from nocl.judge import simulate
+
+    solver, x0 = method(ocp, name, intervals), fresh_states(ocp, n, seed)
+    start, checkpoint = time.perf_counter(), out / "checkpoint" / _solve_key(ocp, name, n, seed, intervals)
+    facts: dict[str, Any] = {"solver": name, "n": n, "seed": fresh_seed(seed)}
+    if name == "lqr":
+        s = simulate(ocp, solver, x0)
+        arrays = {"t": s.t, "x": s.x, "u": s.u, "cost": s.cost, "success": s.success}
+    else:
+        s, arrays, more = _solved(solver, x0, seed, workers, checkpoint)
+        facts |= more
+    path = _write_arrays(out / f"{name}.npz", {"x0": x0, **arrays})
+    store.write_json(out / f"{name}.json", {**facts, "message": list(s.message)})
+    _forget(checkpoint)
+    ok = arrays["success"]
+    mean = f", mean cost {arrays['cost'][ok].mean():.4g}" if ok.any() else ""
+    did = "simulated" if name == "lqr" else "solved"
+    say(f"{name}: {ok.sum()} of {n} {did}{mean}, {time.perf_counter() - start:.1f} s\n{path}")
+
+
+def _solved(solver: Any, x0: np.ndarray[Any, np.dtype[np.float64]], seed: int, workers: int | str,
+            checkpoint: Path) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+    """(solution, its arrays, how sure each optimum is) of NMPC, or of DDP from everywhere."""
+    from nocl.solvers.ddp.global_search import GlobalDDP, solve_globally
+
+    if isinstance(solver, GlobalDDP):
+        found = solve_globally(solver.ddp, x0, starts=solver.starts, seed=seed, workers=workers, out=checkpoint)
+        s, costate = found.best, found.best.V_x
+    else:
+        s = found = solver.solve(x0, workers=workers, out=checkpoint)
+        costate = s.costate
+    arrays = {"t": s.t, "x": s.x, "u": s.u, "cost": s.cost, "success": s.success, "costate": costate}
+    return s, arrays, {"starts": found.starts, "hits": found.hits, "optima": [len(o) for o in found.optima]}
+
+
+def _solve_key(ocp: OCP, *settings: Any) -> str:
+    text = json.dumps([ocp.to_data(), *settings, __version__, version("casadi")], sort_keys=True)
+    return f"{settings[0]}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+
+
+def _write_arrays(path: Path, arrays: dict[str, Any]) -> Path:
+    file = io.BytesIO()
+    np.savez_compressed(file, **arrays)
+    return store.write_bytes(path, file.getvalue())

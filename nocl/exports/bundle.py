@@ -1,0 +1,230 @@
+"""One way out: a controller or model as files for CasADi, L4CasADi, ONNX and C, with the proof that they are it."""
+
+from __future__ import annotations
+
+import copy
+import os
+import shutil
+import tempfile
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from nocl.exports import parity
+from nocl.exports.casadi_forms import to_casadi
+from nocl.exports.parity import Certificate, Finding, Part
+from nocl.support import store
+from nocl.support.checks import Array
+from nocl.sysid.identification import LearnedDynamics
+from nocl.system import System
+
+FORMS = ("casadi", "l4casadi", "onnx", "c")
+PROOF = "parity.json"
+NEEDS = {"l4casadi": ("l4casadi",), "onnx": ("onnx", "onnxruntime")}  # packages
+
+
+def parts_of(thing: Any) -> list[Part]:
+    """The functions of a controller (an object with `parts()`), of learned dynamics or of a list of these.
+
+    Raises ValueError for others, and for a list with two functions of one name or of different systems.
+    """
+    if isinstance(thing, (list, tuple)) and thing:
+        parts = [part for one in thing for part in parts_of(one)]
+        names, systems = [part.name for part in parts], {_system(one).name for one in thing}
+        if len(set(names)) < len(names) or len(systems) > 1:
+            raise ValueError(f"export: got the functions {', '.join(names)} of {', '.join(sorted(systems))}; expected "
+                             "different ones of one system: export the others to another folder")
+        return parts
+    if hasattr(thing, "parts") and callable(thing.parts):
+        made: list[Part] = thing.parts()
+        return made
+    if isinstance(thing, LearnedDynamics):
+        s = thing.system
+        box = {"x": (s.lbx, s.ubx), "u": (s.lbu, s.ubu)}
+        labels = {"x": [s.unit(n) for n in s.state_names], "u": [s.unit(n) for n in s.control_names],
+                  "xdot": [f"d {n} / dt" for n in s.state_names]}
+        net = copy.deepcopy(thing.net).double().eval()
+        return [Part("dynamics", thing.to_casadi(), net, box, labels, net)]
+    raise ValueError(f"export: got a {type(thing).__name__}; expected a CND, LearnedDynamics or a list of them")
+
+
+def export(thing: Any, folder: str | os.PathLike[str], to: Sequence[str] = ("casadi",), *,
+           against: Sequence[str] | None = None) -> Certificate:
+    """Write a CND, LearnedDynamics or a list of them to `folder` in the forms of `to`, and prove them equal to it.
+
+        folder/NAME.casadi            to="casadi": ca.Function.load reads it
+        folder/l4casadi/NAME.casadi   to="l4casadi", with what it needs in l4casadi/lib: do not move the folder
+        folder/onnx/NAME.onnx         to="onnx", float32
+        folder/c, folder/c_float32    to="c"
+        folder/parity.json            the certificate
+
+    Parameters
+    ----------
+    against : what the certificate compares beside native CasADi and the forms of `to`; default: every form whose
+        package or compiler is there
+
+    Returns the Certificate; str() of it is one line. All or nothing: where a limit is passed (float64 1e-12, float32
+    1e-5, see nocl.exports.parity) it raises ValueError, and the folder is as it was.
+    """
+    folder = Path(os.path.abspath(folder))
+    for form in (*to, *(against or ())):
+        if form not in FORMS:
+            raise ValueError(f"export: the form is {form!r}; expected some of {', '.join(FORMS)}")
+    missing = _missing()
+    for form in to:
+        if form in missing:
+            raise ValueError(f"export: to={form!r} needs {missing[form]}")
+    parts, there, new, lib = parts_of(thing), folder.exists(), _folder(folder), folder / "l4casadi" / "lib"
+    before = set(lib.glob("*"))
+    try:
+        with tempfile.TemporaryDirectory(prefix="nocl_export_") as scratch:
+            certificate = _Export(parts, new, lib, Path(scratch), _title(thing)).run(to, against, missing)
+        store.write_json(new / PROOF, certificate.to_data())
+        _merge(new, folder)
+    except BaseException:
+        for path in set(lib.glob("*")) - before:
+            path.unlink()
+        if not there:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
+    finally:
+        shutil.rmtree(new, ignore_errors=True)
+    return certificate
+
+
+def _system(thing: Any) -> System:
+    found: System = thing.system if isinstance(thing, LearnedDynamics) else thing.ocp.system
+    return found
+
+
+def _title(thing: Any) -> tuple[str, str]:
+    things = thing if isinstance(thing, (list, tuple)) else [thing]
+    return _system(things[0]).name, "; ".join(repr(one).split("\n")[0] for one in things)
+
+
+def _missing() -> dict[str, str]:
+    """The forms that cannot be made here, with what they need."""
+    missing = {form: f"the package(s) {', '.join(absent)}: pip install \"nocl[{form}]\"" for form, packages in
+               NEEDS.items() if (absent := [p for p in packages if find_spec(p) is None])}
+    return missing if shutil.which("cc") else missing | {"c": "a C compiler, cc: install gcc"}
+
+
+def _folder(folder: Path) -> Path:
+    """An empty folder beside `folder`."""
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        return Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+    except OSError as error:
+        raise ValueError(f"export: {folder} cannot be made ({error.strerror}): name another folder") from error
+
+
+def _merge(new: Path, folder: Path) -> None:
+    """Move all files in, each by one rename."""
+    try:
+        for path in sorted(p for p in new.rglob("*") if p.is_file()):
+            target = folder / path.relative_to(new)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(path, target)
+    except OSError as error:
+        raise ValueError(f"export: {folder} cannot be written ({error.strerror}): name another folder") from error
+
+
+class _Export:
+    """Files in `new`, or in `scratch` if only compared; what L4CasADi builds must stand where it stays, in `lib`."""
+
+    def __init__(self, parts: list[Part], new: Path, lib: Path, scratch: Path, title: tuple[str, str]) -> None:
+        self.parts, self.new, self.lib, self.scratch, self.title = parts, new, lib, scratch, title
+        self.findings: list[Finding] = []
+        self.z = {part.name: parity.samples(part) for part in parts}
+        self.expected = {part.name: parity.reference_of(part, self.z[part.name]) for part in parts}
+
+    def run(self, to: Sequence[str], against: Sequence[str] | None, missing: dict[str, str]) -> Certificate:
+        compared = [f for f in FORMS if f in to or f == "casadi" or f in (FORMS if against is None else against)]
+        left_out = {f: missing[f] for f in compared if f in missing}
+        for form in compared:
+            if form not in missing:
+                getattr(self, f"_{form}")(form in to)
+        points = min(len(z) for z in self.z.values())
+        return Certificate(self.findings, points, left_out)
+
+    def _compare(self, part: Part, backend: str, dtype: str, values: parity.Rows,
+                 slopes: parity.Rows | None = None) -> None:
+        found = parity.findings(part, backend, dtype, self.z[part.name], values, slopes, self.expected[part.name])
+        for finding in found:
+            if not finding.ok:
+                raise ValueError(f"export: {finding}; nothing was written: the export is not what was trained. A "
+                                 "float32 form may lack the digits for a function this steep: export float64 ones")
+        self.findings += found
+
+    def _casadi(self, keep: bool) -> None:
+        for part in self.parts:
+            self._compare(part, "native CasADi", "float64", *parity.of_casadi(part.column))
+            if keep:
+                part.casadi.save(str(self.new / f"{part.name}.casadi"))
+
+    def _l4casadi(self, keep: bool) -> None:
+        folder = (self.new if keep else self.scratch) / "l4casadi"
+        folder.mkdir()
+        for part in self.parts:
+            if part.net is not None:
+                f = part.casadi
+                built = to_casadi(part.net, backend="l4casadi", name=part.name, in_names=f.name_in(),
+                                  out_names=f.name_out(), build_dir=self.lib if keep else folder)
+                self._compare(part, "L4CasADi", "float32", *parity.of_casadi(built))
+                built.save(str(folder / f"{part.name}.casadi"))
+
+    def _onnx(self, keep: bool) -> None:
+        from nocl.exports.onnx_reader import from_onnx
+        from nocl.exports.onnx_writer import Session, to_onnx
+
+        folder = (self.new if keep else self.scratch) / "onnx"
+        for part in self.parts:
+            if part.net is not None:
+                f = part.casadi
+                path = to_onnx(part.net, folder / f"{part.name}.onnx", in_names=f.name_in(), out_names=f.name_out())
+                session = Session(path)
+                self._compare(part, "ONNX Runtime", "float32", _split(session, part))
+                self._compare(part, "ONNX imported", "float32", *parity.of_casadi(from_onnx(path)))
+
+    def _c(self, keep: bool) -> None:
+        for dtype, name in (("float64", "c"), ("float32", "c_float32")):
+            folder = (self.new if keep else self.scratch) / name
+            for part in self.parts:
+                self._by_c(part, folder, dtype)
+
+    def _by_c(self, part: Part, folder: Path, dtype: str) -> None:
+        """A function's C against its values; networks also get the C of their Jacobian, in passing."""
+        from nocl.exports.c_code import load
+
+        prefix, note = self.title
+        compiled = load(part.to_c(folder, prefix, dtype=dtype, note=note), f"{prefix}_{part.name}")
+        slopes = None
+        if part.net is not None:
+            J = _jacobian(part)
+            m, n = len(self.expected[part.name][1][0]), sum(part.sizes)
+            of = _split(load(J.to_c(self.scratch / f"d_{dtype}", "d", dtype=dtype), f"d_{part.name}"), part)
+
+            def slopes(z: Array) -> Array:
+                return of(z).reshape(len(z), m, n)
+
+        self._compare(part, "C", dtype, _split(compiled, part), slopes)
+
+
+def _split(function: Any, part: Part) -> parity.Rows:
+    """A function of several arguments as one of rows."""
+    ends = np.cumsum(part.sizes)[:-1]
+    return lambda z: function(*np.split(z, ends, axis=1))
+
+
+def _jacobian(part: Part) -> Part:
+    """All first derivatives, row by row, as a Part."""
+    f = part.column
+    args = f.mx_in()
+    J = ca.horzcat(*(ca.jacobian(f(*args), a) for a in args))
+    bounds = {name: part.bounds[name] for name in f.name_in()}
+    column = ca.Function(part.name, args, [ca.vec(ca.densify(J).T)], f.name_in(), ["J"])
+    return Part(part.name, column, part.torch, bounds)

@@ -1,0 +1,183 @@
+"""Systems and problems for other tools: python-control, gymnasium, do-mpc, acados, all optional; Functions taken in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from nocl.support import checks
+from nocl.support.checks import Array
+from nocl.system import System
+from nocl.translate.rk4 import rk4_cost
+
+if TYPE_CHECKING:
+    from nocl.ocp import OCP
+
+
+def package(name: str, distribution: str | None = None) -> Any:
+    """An optional package; ValueError that says how to install it."""
+    try:
+        return import_module(name)
+    except ImportError as error:
+        what = distribution or "nocl[interop]"
+        raise ValueError(f"{name} cannot be imported ({error}): pip install {what!r}") from None
+
+
+def system_from_casadi(f: ca.Function, *, name: str | None = None, lbu: Any, ubu: Any, lbx: Any, ubx: Any,
+                       states: Sequence[str] | None = None, controls: Sequence[str] | None = None,
+                       **options: Any) -> System:
+    """A System whose equations are those of f:(x [nx], u [nu]) -> xdot [nx].
+
+    f is written out in SX: elementary operations only (ValueError for externals, integrators, look-up tables).
+    states, controls : their names; default x0, x1, ..., u0, ...; the other arguments are System's.
+    """
+    if not isinstance(f, ca.Function) or f.n_in() != 2 or f.n_out() != 1 or f.size_out(0) != f.size_in(0) or \
+            f.size2_in(0) != 1 or f.size2_in(1) != 1:
+        raise ValueError(f"System.from_casadi: got {f}; expected a casadi.Function (x [nx], u [nu]) -> xdot [nx] of "
+                         "columns")
+    nx, nu = f.size1_in(0), f.size1_in(1)
+    parts = []
+    for names, n, letter, what in ((states, nx, "x", "states"), (controls, nu, "u", "controls")):
+        chosen = [f"{letter}{i}" for i in range(n)] if names is None else list(names)
+        if len(chosen) != n:
+            raise ValueError(f"System.from_casadi: {what} has {len(chosen)} names; {f.name()} has {n}: name each")
+        parts.append(ca.vertcat(*map(ca.SX.sym, chosen)))
+    from nocl.translate.instructions import expand
+
+    x, u = parts
+    return System(name or f.name(), x=x, u=u, xdot=expand(f)(x, u), lbu=lbu, ubu=ubu, lbx=lbx, ubx=ubx, **options)
+
+
+def to_control(system: System) -> Any:
+    """python-control's NonlinearIOSystem of the system: inputs u (not clipped to U), outputs x."""
+    control, f = package("control"), system.f
+
+    def update(t: float, x: Array, u: Array, params: Any) -> Array:
+        return f(x, u).full().ravel()
+
+    return control.NonlinearIOSystem(update, None, inputs=list(system.control_names), outputs=list(system.state_names),
+                                     states=list(system.state_names), name=system.name)
+
+
+def to_statespace(system: System, x: ArrayLike, u: ArrayLike) -> Any:
+    """python-control's StateSpace of the linearisation at (x, u): A, B exact, C = I."""
+    A, B = system.linearize(x, u)
+    return package("control").StateSpace(A, B, np.eye(system.nx), np.zeros((system.nx, system.nu)),
+                                         inputs=list(system.control_names), outputs=list(system.state_names),
+                                         states=list(system.state_names), name=system.name)
+
+
+def to_do_mpc(system: System) -> Any:
+    """do-mpc's continuous Model of the system, set up; states and controls under their names."""
+    model = package("do_mpc", "do-mpc").model.Model("continuous", "SX")
+    x = ca.vertcat(*(model.set_variable("_x", n) for n in system.state_names))
+    u = ca.vertcat(*(model.set_variable("_u", n) for n in system.control_names))
+    for name, rate in zip(system.state_names, ca.vertsplit(system.f(x, u)), strict=True):
+        model.set_rhs(name, rate)
+    model.setup()
+    return model
+
+
+def to_acados(system: System) -> Any:
+    """acados' AcadosModel of the system: x, u, xdot, explicit and implicit equations, in SX."""
+    try:
+        model = package("acados_template").AcadosModel()
+    except ValueError as error:
+        raise ValueError(f"{error}, or acados' own interfaces/acados_template") from None
+    model.name, model.x, model.u = system.name, ca.SX(system.x), ca.SX(system.u)
+    model.xdot = ca.SX.sym("xdot", system.nx)
+    model.f_expl_expr = system.f(model.x, model.u)
+    model.f_impl_expr = model.xdot - model.f_expl_expr
+    return model
+
+
+def to_gymnasium(ocp: OCP, *, steps: int = 80, integrator: str = "rk4", observe_time: bool = True) -> Any:
+    """A gymnasium.Env of the problem: `steps` equal intervals over the horizon, controls held and clipped to U.
+
+    Observations are x, then t (unless observe_time is False), float64; actions are u in U; the reward of a step is
+    minus the integral of L over it, in the last step also minus G(x(T)): the return is minus the cost. Episodes are
+    terminated at the horizon, with a reward of the step's cost at the last finite state where the state blows up.
+    reset(options={"x0": x}) starts at a given state. info has "cost", the cost so far, and "clearance", the least path
+    constraint at the state. integrator: "rk4", the discretisation of NMPC, or "cvodes", the judge's. Path constraints
+    are reported, and not in the reward.
+    """
+    if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
+        raise ValueError(f"to_gymnasium: steps is {steps!r}; expected an integer >= 1")
+    if integrator not in ("rk4", "cvodes"):
+        raise ValueError(f"to_gymnasium: integrator is {integrator!r}; expected 'rk4' or 'cvodes'")
+    gymnasium = package("gymnasium")
+    step = _step(ocp, ocp.horizon / steps, integrator)
+    return _environment(gymnasium, ocp, int(steps), step, observe_time)
+
+
+def _step(ocp: OCP, h: float, integrator: str) -> Callable[[Array, Array], tuple[Array, float]]:
+    """(x, u) -> (x after h, the integral of L)."""
+    s = ocp.system
+    if integrator == "rk4":
+        x, u = ca.SX.sym("x", s.nx), ca.SX.sym("u", s.nu)
+        function = ca.Function("step", [x, u], list(rk4_cost(s.f, ocp.L, x, u, h)))
+    else:
+        z, u = ca.SX.sym("z", s.nx + 1), ca.SX.sym("u", s.nu)
+        dae = {"x": z, "p": u, "ode": ca.vertcat(s.f(z[:-1], u), ocp.L(z[:-1], u))}
+        judge = ca.integrator("step", "cvodes", dae, 0.0, h, {"reltol": 1e-9, "abstol": 1e-10})
+        start, held = ca.MX.sym("x", s.nx), ca.MX.sym("u", s.nu)
+        end: Any = judge(x0=ca.vertcat(start, 0), p=held)["xf"]
+        function = ca.Function("step", [start, held], [end[:-1], end[-1]])
+
+    def step(x: Array, u: Array) -> tuple[Array, float]:
+        after, cost = function(x, u)
+        return after.full().ravel(), float(cost)
+
+    return step
+
+
+def _environment(gymnasium: Any, ocp: OCP, steps: int, step: Callable[[Array, Array], tuple[Array, float]],
+                 observe_time: bool) -> Any:
+    s, box = ocp.system, gymnasium.spaces.Box
+    free, time = np.full(s.nx, np.inf), [ocp.horizon] if observe_time else []
+
+    class Environment(gymnasium.Env):  # type: ignore[misc]
+        metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 (gymnasium's own)
+
+        def __init__(self) -> None:
+            self.ocp, self.render_mode = ocp, None
+            self.observation_space = box(np.r_[-free, 0 * np.array(time)], np.r_[free, time], dtype=np.float64)
+            self.action_space = box(s.lbu, s.ubu, dtype=np.float64)
+            self.k, self.x, self.cost = steps, np.array(ocp.x_goal), 0.0
+
+        def reset(self, *, seed: int | None = None,
+                  options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
+            super().reset(seed=seed)
+            given = (options or {}).get("x0")
+            x0 = ocp.initial_states.sample(1, self.np_random)[0] if given is None else given
+            self.k, self.x, self.cost = 0, checks.vector(x0, s.nx, "x0", f"environment of {s.name}").copy(), 0.0
+            return self._observation(), self._info()
+
+        def step(self, action: ArrayLike) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+            if self.k >= steps:
+                raise ValueError("the episode is over; expected reset() before another step")
+            u = np.clip(checks.vector(action, s.nu, "action", f"environment of {s.name}"), s.lbu, s.ubu)
+            x, cost = step(self.x, u)
+            blown = not (np.isfinite(x).all() and np.isfinite(cost))
+            self.k = steps if blown else self.k + 1
+            if blown:
+                cost = float(ocp.L(self.x, u)) * ocp.horizon / steps
+            else:
+                self.x = x
+            cost += float(ocp.G(self.x)) if self.k == steps else 0.0
+            self.cost += cost
+            return self._observation(), -cost, self.k == steps, False, self._info()
+
+        def _observation(self) -> Array:
+            return np.r_[self.x, self.k * ocp.horizon / steps] if observe_time else self.x.copy()
+
+        def _info(self) -> dict[str, Any]:
+            h = ocp.h(self.x).full().ravel()
+            return {"cost": self.cost, "clearance": float(h.min(initial=np.inf))}
+
+    return Environment()

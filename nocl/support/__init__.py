@@ -1,0 +1,1 @@
+"""What knows nothing of control: checks of input, data-only files, processes, compilers, threads, Ctrl-C."""

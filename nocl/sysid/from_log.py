@@ -1,0 +1,109 @@
+"""f_theta from logged trajectories: derivatives first, then what a simulation of f_theta gets wrong.
+
+1. Smoothed (or logged) derivatives give a first f_theta: least squares by L-BFGS (scipy). Smoothing leaves a bias.
+2. The simulation error on windows of the log as it is, noise and all, by Gauss-Newton (nocl.sysid.logs.shooting).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from torch import Tensor
+
+from nocl.nets import MLP, FeatureNet
+from nocl.support.checks import Array
+from nocl.sysid import fitting
+from nocl.sysid.logs.log import Log, Run
+from nocl.sysid.logs.shooting import Windows, fit_simulation, spread_of
+from nocl.sysid.logs.smoothing import labels
+from nocl.sysid.networks import assemble
+from nocl.sysid.progress import Progress
+from nocl.sysid.settings import LogSettings
+from nocl.sysid.structure import Structure
+
+MEMORY = 30  # of L-BFGS
+
+
+def fit_log(log: Log, parts: Structure, settings: LogSettings, seed: int, bar: Progress) -> FeatureNet:
+    """f_theta of the given structure, fitted to a log."""
+    x, u, xdot = (np.concatenate(a) for a in zip(*map(labels, log), strict=True))
+    net = assemble(parts, initial(parts, settings, seed), settings.angles)
+    if not parts.groups:
+        return net
+    unit = output_units(parts, net, xdot)
+    fit_derivatives(net, unit, x, u, xdot, settings, bar)
+    if settings.steps:
+        windows = Windows.of(log, settings.window, settings.windows, np.random.default_rng((seed, 3)))
+        with bar.stage("simulation error", settings.steps) as report:
+            fit_simulation(net, unit, windows, steps=settings.steps, substeps=settings.substeps, ridge=settings.ridge,
+                           report=report)
+    return net.requires_grad_(False)
+
+
+def first_states(log: Log) -> list[tuple[Array, Run]]:
+    """Each run with its smoothed states at all samples but the last."""
+    return [(run.smooth.x[:-1], run) for run in log]
+
+
+def initial(parts: Structure, settings: LogSettings, seed: int) -> list[fitting.Weights]:
+    """Random hidden layers, outputs zero."""
+    generator, h, angles = torch.Generator().manual_seed(seed), settings.width, parts.split.box.angles
+    weights: list[fitting.Weights] = []
+    for group in parts.groups:
+        F, m = len(group.variables) + sum(k in angles for k in group.variables if settings.angles), \
+            len(group.coefficients)
+        W1 = torch.randn(h, F + 1, generator=generator, dtype=torch.float64) / F**0.5
+        W2 = torch.randn(h, h + 1, generator=generator, dtype=torch.float64) / h**0.5
+        weights.append([W1, W2, torch.zeros(m, h + 1 + F, dtype=torch.float64)])
+    return weights
+
+
+def output_units(parts: Structure, net: FeatureNet, xdot: Array) -> Array:
+    """What each parameter is measured in: the spread of its row of xdot in an output layer, 1 elsewhere."""
+    spread = spread_of(xdot)
+    entries = [e for expansion in parts.expansions for e in expansion.entries]
+    units = []
+    for group, mlp in zip(parts.groups, net.nets, strict=True):
+        assert isinstance(mlp, MLP)
+        own = spread[[entries[c] // parts.split.columns for c in group.coefficients]]
+        for name, p in mlp.named_parameters():
+            last = name.startswith(("body.4", "skip"))
+            units.append(np.repeat(own, p.numel() // len(own)) if last else np.ones(p.numel()))
+    return np.concatenate(units)
+
+
+def fit_derivatives(net: FeatureNet, unit: Array, x: Array, u: Array, xdot: Array, settings: LogSettings,
+                    bar: Progress) -> None:
+    """Least squares of f_theta(x, u) - xdot, each row in units of its spread; changes the network."""
+    X, U, Y = (torch.from_numpy(np.ascontiguousarray(a)) for a in (x, u, xdot))
+    scale = torch.from_numpy(1 / spread_of(xdot))
+
+    with bar.stage("derivatives", settings.iterations) as report:
+        _descend(net, unit, lambda: ((net(X, U) - Y) * scale).square().mean(), settings.iterations, settings.ridge,
+                 report)
+
+
+def _descend(net: FeatureNet, unit: Array, loss: Callable[[], Tensor], iterations: int, ridge: float,
+             report: Callable[[float], None]) -> None:
+    """Minimise loss() + ridge * |theta|^2 over the network's parameters, theta = parameters / unit, by L-BFGS."""
+    parameters = [p.requires_grad_() for p in net.parameters()]
+    first = torch.nn.utils.parameters_to_vector(parameters).detach().numpy() / unit
+
+    def put(theta: Array) -> None:
+        with torch.no_grad():
+            torch.nn.utils.vector_to_parameters(torch.from_numpy(theta * unit), parameters)
+
+    def value_and_gradient(theta: Array) -> tuple[float, Array]:
+        put(theta)
+        value = loss()
+        gradient = np.concatenate([g.numpy().ravel() for g in torch.autograd.grad(value, parameters)])
+        return float(value.detach()) + ridge * float(theta @ theta), gradient * unit + 2 * ridge * theta
+
+    result = minimize(value_and_gradient, first, jac=True, method="L-BFGS-B",
+                      callback=lambda intermediate_result: report(intermediate_result.fun**0.5),
+                      options={"maxiter": iterations, "maxfun": 2 * iterations, "maxcor": MEMORY, "ftol": 1e-12,
+                               "gtol": 1e-9})
+    put(result.x)

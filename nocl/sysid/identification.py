@@ -1,0 +1,319 @@
+"""System identification: f_theta, a network that answers like xdot = f(x, u), from labels of f and its Jacobians.
+
+The default recipe reads the structure off the Jacobian labels first (nocl.sysid.structure): what is exactly known is kept
+in closed form, and each group of entries with the same variables gets one small network, fitted to values and
+derivatives (nocl.sysid.fitting). Where there is no structure to find, one network learns everything.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import casadi as ca
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+
+from nocl.data import Dataset
+from nocl.exports.casadi_forms import to_casadi
+from nocl.nets import MLP, FeatureNet
+from nocl.sampling import Seed
+from nocl.support import checks, store
+from nocl.support.checks import Array
+from nocl.support.threads import one_thread
+from nocl.sysid import paper
+from nocl.sysid.from_log import first_states, fit_log
+from nocl.sysid.labels import Source, box_of, data_box, find_structure, labelled, rows_of, some_labels
+from nocl.sysid.logs.coverage import Coverage, share_of_nodes
+from nocl.sysid.logs.log import Log
+from nocl.sysid.logs.validation import HORIZONS, Validation, validate
+from nocl.sysid.networks import assemble, fit_group, fit_groups, weights_of
+from nocl.sysid.progress import Checkpoint, Progress
+from nocl.sysid.score import Score, contradictions, score_of
+from nocl.sysid.settings import LogSettings, PaperSettings, Settings
+from nocl.sysid.stated import Known, Stated
+from nocl.sysid.structure import Box, Expansion, Group, Split, Structure
+from nocl.sysid.trial import better_affine
+from nocl.system import System
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["LearnedDynamics", "LogSettings", "PaperSettings", "Score", "Settings", "identify"]
+
+METHODS = ("default", "mlp", "paper")
+KIND = "dynamics"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LearnedDynamics:
+    """xdot = f_theta(x, u): torch rows x [B, nx], u [B, nu] in float64 -> [B, nx].
+
+    The system gives names, boxes and, in `score` and `refine` only, the exact f to compare with or to ask for labels.
+    """
+
+    system: System
+    net: FeatureNet
+    structure: str  # what was found, in words
+    card: Mapping[str, Any] = field(default_factory=dict)  # how it was made: method, seed, settings, labels, score
+    parts: Structure | None = None  # the structure itself; None for a network that learned everything
+    coverage: Coverage | None = None  # where the log has been that it was learned from
+
+    def __call__(self, x: Tensor, u: Tensor) -> Tensor:
+        return self.net(x, u)
+
+    def to_casadi(self) -> ca.Function:
+        """f:(x, u)->(xdot), native MX, equal to torch to rounding."""
+        return to_casadi(self.net, name="f", in_names=["x", "u"], out_names=["xdot"])
+
+    def to_system(self) -> System:
+        """The system with f_theta for its equations, in its own symbols: for problems on a plant that is not known.
+
+        SX of all networks: for small ones, as logs teach them.
+        """
+        f, s = self.to_casadi().expand(), self.system
+        return replace(s, xdot=f(s.x, s.u))
+
+    def validate(self, log: Log, steps: Sequence[int] = HORIZONS, *, every: int | None = None) -> Validation:
+        """Errors of simulations of f_theta from a log's states, by number of steps: see nocl.validation."""
+        log.check(self.system)
+        return validate(self.net, log, steps, every, int(self.card.get("settings", {}).get("substeps", 1)))
+
+    def outside(self, x: ArrayLike, what: str | None = None) -> Any:
+        """Which states [N, nx] the model was not taught about, [N] bool; a UserWarning names `what`, where given.
+
+        For a model of a log, what is far from all logged states (nocl.coverage); else, what is outside the box X.
+        """
+        if self.coverage is not None:
+            return self.coverage.outside(x) if what is None else self.coverage.warn(x, what)
+        rows, _ = checks.states(x, self.system.nx, self.system.name, "x")
+        outside = ((rows < self.system.lbx) | (rows > self.system.ubx)).any(axis=1)
+        if what is not None and outside.any():
+            warnings.warn(f"{outside.sum()} of {len(rows)} {what} lie outside the box X of {self.system.name!r}, which "
+                          "the model was taught in: widen lbx, ubx", UserWarning, stacklevel=2)
+        return outside
+
+    def doubt(self, x: ArrayLike, u: ArrayLike) -> Array:
+        """The share of each trajectory's states x [B, K+1, nx] (controls u for their number) that is `outside`: [B]."""
+        return share_of_nodes(lambda rows, _: self.outside(rows), x, u)
+
+    def plot(self) -> Figure:
+        """f_theta, and the exact f where it is known, along each variable through the middle of the box."""
+        from nocl.sysid.figures import slices
+
+        return slices(self)
+
+    def score(self, n: int = 2000, seed: Seed = 1_000_003) -> Score:
+        """Errors against the exact f at n fresh uniform samples of the box X x U; ValueError where f is not known."""
+        if self.system.xdot is None:
+            raise ValueError(f"score: the equations of {self.system.name!r} are not known, there is nothing to compare "
+                             "with: model.validate(log) has the errors of simulations on logs")
+        return score_of(self.net, Dataset.sample(self.system, n, seed))
+
+    def refine(self, states: ArrayLike, controls: ArrayLike, *, spread: float = 0.05, share: float = 0.7, seed: int = 0,
+               settings: Settings | None = None, progress: bool = True) -> LearnedDynamics:
+        """More training where solutions go: `share` of the samples near rows (states [N, nx], controls [N, nu]).
+
+        Near: normal noise of `spread` times the width of the box; the other samples fill the box. The networks
+        go on from their weights; the structure stays. Asks the system for labels. Raises ValueError for rows that do
+        not fit, and for a model with nothing to train.
+        """
+        return _refined(self, states, controls, spread, share, seed, settings or Settings(), progress)
+
+    def save(self, folder: str | Path) -> Path:
+        """Write folder/dynamics.safetensors: weights, maps, the system's equations and the card, as data."""
+        parts = None if self.parts is None else _structure_data(self.parts)
+        coverage = None if self.coverage is None else self.coverage.to_data()
+        card = {"system": self.system.to_data(), "structure": self.structure, "card": dict(self.card), "parts": parts,
+                "coverage": coverage}
+        known = {} if self.parts is None else {"linear": self.parts.linear, "exact": self.parts.exact}
+        return store.save(folder, KIND, nets={"f": self.net}, functions=known, card=card)
+
+    @staticmethod
+    def load(folder: str | Path) -> LearnedDynamics:
+        """What `save` wrote, bit by bit; ValueError for a missing, altered or foreign file."""
+        record = store.load(folder, KIND)
+        system = System.from_data(record.card["system"])
+        parts = _structure_from(record.card["parts"], record.functions, box_of(system))
+        coverage = record.card.get("coverage")
+        return LearnedDynamics(system, record.nets["f"].eval(), record.card["structure"], record.card["card"], parts,
+                               None if coverage is None else Coverage.from_data(coverage))
+
+    def __repr__(self) -> str:
+        nets = [net for net in self.net.nets if isinstance(net, MLP)]
+        sizes = ", ".join("-".join(map(str, net.sizes)) for net in nets) or "none: all in closed form"
+        return (f"LearnedDynamics of {self.system.name!r} ({self.card.get('method', '?')})\n  {self.structure}\n"
+                f"  networks: {sizes}\n  {self.card.get('score', 'not scored')}")
+
+
+@one_thread()
+def identify(system: System, *, data: Dataset | Log | None = None, method: str = "default", gradients: bool = True,
+             known: Known | None = None, control_affine: bool = False, seed: int = 0,
+             settings: Settings | PaperSettings | LogSettings | None = None, progress: bool = True,
+             checkpoint: str | Path | None = None) -> LearnedDynamics:
+    """f_theta ~ f on the box X x U, learned from labels of f (values and, with `gradients`, Jacobians) or from logs.
+
+    Parameters
+    ----------
+    system : System
+        Answers for labels at samples of its box; its equations are never read. With `data`, training takes names, boxes
+        and angles from it only, and its equations may be unknown (xdot=None). The score on the card compares with
+        them where they are known; for a Log, it is of simulations on that log.
+    data : Dataset or Log
+        Labels to learn from instead; without Jacobians A, B, from values alone. A Log of trajectories is fitted by its
+        smoothed derivatives, then by simulation error (nocl.sysid_logs).
+    known : dict from states to their derivatives (SX, numbers, names of states or controls), or names of states
+        Equations that need not be learned; a bare name stands for the system's own equation.
+    control_affine : bool
+        xdot = a(x) + B(x) u. Labels of f with Jacobians show that by themselves: drawn ones by moving the controls
+        alone, given ones by a trial (nocl.sysid_affine).
+    method : "default", "mlp" or "paper"
+        Structure first; one plain sine network; the paper's network, loss and optimiser.
+    settings : Settings, (method "paper") PaperSettings or (logs) LogSettings
+        Budgets and sizes.
+    checkpoint : folder
+        Finished networks are kept there, and not trained again when the same call is repeated ("paper", logs: unused;
+        the trials of given labels are made again).
+
+    Raises
+    ------
+    ValueError
+        For settings, data or labels that cannot be used, with the remedy; for controls that are stated to be affine
+        where labels show a closed form, or are drawn and show that they are not.
+
+    Warns
+    -----
+    UserWarning
+        Where the labels speak against what is stated.
+    """
+    settings = _check_arguments(system, method, settings, seed, data)
+    stated, start, bar = Stated.of(system, known, control_affine), time.perf_counter(), Progress(system.name, progress)
+    if isinstance(data, Log):
+        assert isinstance(settings, LogSettings)
+        return _from_log(system, data, stated, settings, seed, bar)
+    assert not isinstance(settings, LogSettings)
+    source = Source.of(system, data, gradients)
+    _check_stated(stated, method)
+    if isinstance(settings, PaperSettings):
+        net, parts = paper.train(source, settings, seed, bar), None
+        words = "one network of all variables, as in the paper"
+    else:
+        if method == "mlp":
+            settings = replace(settings, structure=False, angles=False)
+        parts = find_structure(source, settings, seed, stated)
+        if settings.structure and not stated.control_affine:
+            parts = better_affine(source, parts, settings, seed, bar)
+        kept = Checkpoint(None, {}) if checkpoint is None else Checkpoint.at(checkpoint, system, seed, settings, {
+            "structure": _structure_data(parts), "gradients": source.gradients, "data": source.digest})
+        weights = fit_groups(source, parts, settings, seed, bar, kept)
+        net, words = assemble(parts, weights, settings.angles), parts.words
+        _warn_of(contradictions(net, source.box, stated, *some_labels(source, 500, seed)) if stated else [])
+    card = {"method": method, "gradients": source.gradients, "seed": seed, "settings": asdict(settings),
+            "labels": source.labels, "seconds": round(time.perf_counter() - start, 3), "torch": torch.__version__}
+    card["score"] = _score_text(system, net)
+    return LearnedDynamics(system, net, words, card, parts)
+
+
+def _score_text(system: System, net: FeatureNet) -> str:
+    if system.xdot is None:
+        return "not scored: the equations are not known"
+    return str(score_of(net, Dataset.sample(system, 2000, 1_000_003)))
+
+
+def _from_log(system: System, log: Log, stated: Stated, settings: LogSettings, seed: int,
+              bar: Progress) -> LearnedDynamics:
+    """f_theta from a log; the card's score is of simulations on that very log."""
+    log.check(system)
+    start = time.perf_counter()
+    parts = stated.plain(data_box(system, np.vstack([np.hstack([s, r.u]) for s, r in first_states(log)])))
+    net = fit_log(log, parts, settings, seed, bar)
+    seen = validate(net, log, (1, settings.window), substeps=settings.substeps)
+    errors = ", ".join(f"{100 * e:.3g} % after {k}" for k, e in zip(seen.steps, seen.relative, strict=True))
+    card = {"method": "log", "gradients": False, "seed": seed, "settings": asdict(settings), "labels": len(log),
+            "seconds": round(time.perf_counter() - start, 3), "torch": torch.__version__,
+            "score": f"simulation error on its own log, in units of the states' spread: {errors} steps"}
+    return LearnedDynamics(system, net, parts.words, card, parts, Coverage.of(log, system))
+
+
+def _warn_of(contradictions: list[str]) -> None:
+    if contradictions:
+        warnings.warn(f"identify: the labels speak against what is stated, or the fit is poor: "
+                      f"{'; '.join(contradictions)}", UserWarning, stacklevel=3)
+
+
+def _check_stated(stated: Stated, method: str) -> None:
+    if stated and method == "paper":
+        raise ValueError("identify: method 'paper' learns everything; expected no `known` and no `control_affine`: use "
+                         "the default method")
+
+
+def _check_arguments(system: System, method: str, settings: Settings | PaperSettings | LogSettings | None, seed: int,
+                     data: Dataset | Log | None) -> Settings | PaperSettings | LogSettings:
+    if not isinstance(system, System):
+        raise ValueError(f"identify: system is a {type(system).__name__}; expected a nocl.System: "
+                         "of an OCP, pass ocp.system")
+    if method not in METHODS:
+        raise ValueError(f"identify: method is {method!r}; expected one of {', '.join(METHODS)}")
+    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
+        raise ValueError(f"identify: seed is {seed!r}; expected an integer >= 0")
+    if isinstance(data, Log) and method != "default":
+        raise ValueError(f"identify: method is {method!r}; logs take 'default' only: leave it out")
+    expected = LogSettings if isinstance(data, Log) else PaperSettings if method == "paper" else Settings
+    if settings is None:
+        return expected()
+    if not isinstance(settings, expected):
+        raise ValueError(f"identify: settings is a {type(settings).__name__}; method {method!r} takes "
+                         f"{expected.__name__}: pass nocl.sysid.{expected.__name__}(...)")
+    return settings
+
+
+def _refined(model: LearnedDynamics, states: ArrayLike, controls: ArrayLike, spread: float, share: float, seed: int,
+             settings: Settings, progress: bool) -> LearnedDynamics:
+    system, parts = model.system, model.parts
+    if parts is None or not parts.groups:
+        raise ValueError("refine: the model has no networks that could be trained; expected one of method 'default' or "
+                         "'mlp' that is not all in closed form")
+    if not (np.isfinite(spread) and spread > 0 and 0 < share <= 1):
+        raise ValueError(f"refine: spread is {spread}, share is {share}; expected spread > 0 and 0 < share <= 1")
+    near = np.hstack([checks.states(states, system.nx, system.name, "states")[0],
+                      checks.states(controls, system.nu, system.name, "controls")[0]])
+    rng, source, start = np.random.default_rng((seed, 2)), Source.of(system, None, True), time.perf_counter()
+    n, box = rows_of(parts, settings), parts.split.box
+    z = box.sample(n, rng)
+    tube = rng.random(n) < share
+    picked = near[rng.integers(len(near), size=int(tube.sum()))]
+    z[tube] = picked + spread * box.width * rng.standard_normal(picked.shape)
+    pool, bar = labelled(source, parts, z), Progress(system.name, progress)
+    old = [weights_of(net) for net in model.net.nets if isinstance(net, MLP)]
+    angles = bool(model.card["settings"]["angles"])
+    settings = replace(settings, angles=angles)
+    weights = [fit_group(parts, pool, i, settings, seed, bar, w) for i, w in enumerate(old)]
+    net = assemble(parts, weights, angles)
+    card = {**model.card, "labels": model.card["labels"] + source.labels, "refined": model.card.get("refined", 0) + 1,
+            "seconds": round(model.card["seconds"] + time.perf_counter() - start, 3),
+            "score": str(score_of(net, Dataset.sample(system, 2000, 1_000_003)))}
+    return LearnedDynamics(system, net, model.structure, card, parts)
+
+
+def _structure_data(parts: Structure) -> dict[str, Any]:
+    split = parts.split
+    return {"affine": list(split.affine), "w0": split.w0.tolist(), "h": split.h.tolist(), "words": parts.words,
+            "labels": parts.labels, "groups": [[list(g.variables), list(g.coefficients)] for g in parts.groups],
+            "expansions": [[list(e.entries), list(e.variables), list(e.degrees)] for e in parts.expansions],
+            "lb": split.box.lb.tolist(), "ub": split.box.ub.tolist()}
+
+
+def _structure_from(data: Mapping[str, Any] | None, functions: Mapping[str, ca.Function], box: Box) -> Structure | None:
+    if data is None:
+        return None
+    box = replace(box, lb=np.array(data["lb"]), ub=np.array(data["ub"]))
+    split = Split(box, tuple(data["affine"]), np.array(data["w0"]), np.array(data["h"]))
+    expansions = tuple(Expansion(box, *map(tuple, parts)) for parts in data["expansions"])
+    groups = tuple(Group(tuple(v), tuple(c)) for v, c in data["groups"])
+    return Structure(split, functions["linear"], expansions, functions["exact"], groups, data["words"], data["labels"])

@@ -1,0 +1,176 @@
+"""From CasADi expressions to compiled C over a batch: one problem a vector lane, blocks of lanes shared by threads."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from nocl.translate.instructions import instructions
+
+CACHE_VARIABLE = "NOCL_CACHE"  # names a folder for compiled kernels; without it they live as long as the process
+HEADERS = Path(__file__).parent / "csrc"
+FLAGS = ("-std=gnu11", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-flax-vector-conversions",
+         "-Wno-psabi", "-fPIC", "-shared")
+
+_BINARY = {"OP_ADD": "{} + {}", "OP_SUB": "{} - {}", "OP_MUL": "{} * {}", "OP_DIV": "{} / {}",
+           "OP_LT": "truth({} < {})", "OP_LE": "truth({} <= {})", "OP_EQ": "truth({} == {})",
+           "OP_NE": "truth({} != {})", "OP_AND": "truth(({} != 0) & ({} != 0))",
+           "OP_OR": "truth(({} != 0) | ({} != 0))", "OP_IF_ELSE_ZERO": "where({} != 0, {}, (lane){{0}})",
+           "OP_POW": "v_pow({}, {})", "OP_CONSTPOW": "v_pow({}, {})", "OP_ATAN2": "v_atan2({}, {})",
+           "OP_HYPOT": "v_hypot({}, {})", "OP_FMOD": "v_fmod({}, {})", "OP_REMAINDER": "v_remainder({}, {})",
+           "OP_COPYSIGN": "v_copysign({}, {})", "OP_FMIN": "v_fmin({}, {})", "OP_FMAX": "v_fmax({}, {})"}
+_UNARY = {"OP_ASSIGN": "{}", "OP_NEG": "-{}", "OP_SQ": "{0} * {0}", "OP_TWICE": "{0} + {0}", "OP_INV": "1 / {}",
+          "OP_NOT": "truth({} == 0)"}
+_UNARY |= {f"OP_{name.upper()}": f"v_{name}({{}})" for name in (
+    "sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh",
+    "atanh", "floor", "ceil", "fabs", "sign", "erf", "log1p", "expm1")}
+
+
+def emit(name: str, inputs: Sequence[ca.SX], outputs: Sequence[ca.SX]) -> str:
+    """C source of `static void name(const lane *i0, ..., lane *o0, ...)`: the nonzeros of SX outputs, lane by lane.
+
+    Raises ValueError for an operation that has no C twin, naming it and the function.
+    """
+    function = ca.Function(name, list(inputs), list(outputs), {"allow_free": False})
+    arguments = [f"const lane *i{i}" for i in range(len(inputs))] + [f"lane *o{i}" for i in range(len(outputs))]
+    lines, current = [f"static void {name}({', '.join(arguments)})", "{"], dict[int, str]()
+    for number, step in enumerate(instructions(function)):
+        if step.op == "OP_OUTPUT":
+            lines.append(f"    o{step.out[0]}[{step.out[1]}] = {current[step.args[0]]};")
+            continue
+        if step.op == "OP_INPUT":
+            right = f"i{step.args[0]}[{step.args[1]}]"
+        elif step.op == "OP_CONST":
+            right = f"splat({_constant(step.value)})"
+        else:
+            right = _operation(step.op, [current[a] for a in step.args], name)
+        lines.append(f"    const lane t{number} = {right};")
+        current[step.out[0]] = f"t{number}"
+    return "\n".join([*lines, "}", ""])
+
+
+def _constant(value: float) -> str:
+    if np.isfinite(value):
+        return repr(float(value))
+    return "NAN" if np.isnan(value) else "INFINITY" if value > 0 else "-INFINITY"
+
+
+def _operation(op: str, args: list[str], function: str) -> str:
+    template = _BINARY.get(op) if len(args) == 2 else _UNARY.get(op)
+    if template is None:
+        raise ValueError(f"{function}: CasADi's {op} has no C kernel; rewrite the expression without it")
+    return template.format(*args)
+
+
+class NoCompilerError(ValueError):
+    """There is no C compiler on this machine."""
+
+
+class Kernel:
+    """A compiled library of source that includes lanes.h: its functions take (first block, last block, index, ...)."""
+
+    def __init__(self, source: str, cache: str | os.PathLike[str] | None = None) -> None:
+        self._library = ctypes.CDLL(str(_build(source, cache)))
+        self.width = int(self._library.nocl_width())
+
+    def __call__(self, name: str, problems: NDArray[np.int64], *args: object, threads: int = 1) -> None:
+        """Run function `name` on the given problem numbers, blocks of lanes shared among threads."""
+        blocks = -(-len(problems) // self.width)
+        if not blocks:
+            return
+        padding = np.full(blocks * self.width - len(problems), problems[-1])  # lanes left over repeat the last problem
+        index = np.concatenate([problems, padding]).astype(np.int64)
+        pointers = [_c(a) for a in args]
+        share = -(-blocks // max(threads, 1))
+        pieces = [(s, min(s + share, blocks)) for s in range(0, blocks, share)]
+
+        def run(piece: tuple[int, int]) -> None:
+            function = self._library[name]  # a fresh handle: argument types are the handle's
+            function(ctypes.c_int64(piece[0]), ctypes.c_int64(piece[1]), _c(index), *pointers)
+
+        if len(pieces) < 2:
+            for piece in pieces:
+                run(piece)
+        else:
+            with ThreadPoolExecutor(len(pieces)) as pool:  # ctypes releases the interpreter's lock
+                list(pool.map(run, pieces))
+
+
+def _c(value: object) -> Any:
+    if value is None:
+        return ctypes.c_void_p(None)
+    if isinstance(value, np.ndarray):
+        if not value.flags.c_contiguous or value.dtype not in (np.float64, np.float32, np.int64):
+            raise ValueError(f"a kernel got an array of {value.dtype}, contiguous: {value.flags.c_contiguous}")
+        return ctypes.c_void_p(value.ctypes.data)
+    return ctypes.c_int64(int(value))  # type: ignore[call-overload]
+
+
+def _compiler() -> list[str]:
+    """The command of the C compiler: $CC, or else gcc or cc; NoCompilerError where there is none."""
+    named = shlex.split(os.environ.get("CC", ""))
+    for command in [named] if named else [["gcc"], ["cc"]]:
+        path = shutil.which(command[0])
+        if path:
+            return [path, *command[1:]]
+    looked = f"CC={named[0]}" if named else "gcc, cc"
+    raise NoCompilerError(f"no C compiler found (looked for {looked}), and kernels are C: install gcc, or name one in "
+                          "CC")
+
+
+@lru_cache
+def _version(path: str) -> str:
+    return subprocess.run([path, "--version"], capture_output=True, text=True, check=False).stdout
+
+
+@lru_cache
+def _own_folder() -> tempfile.TemporaryDirectory[str]:
+    return tempfile.TemporaryDirectory(prefix="nocl-kernels-")
+
+
+def _machine() -> str:
+    """What -march=native means here: kernels of one machine must not be loaded on another."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        flags = next(line for line in lines if line.startswith(("flags", "Features")))
+    except (OSError, StopIteration):
+        flags = platform.processor()
+    return platform.machine() + flags
+
+
+def _build(source: str, cache: str | os.PathLike[str] | None) -> Path:
+    """The compiled library of this source, from the cache folder where it is there; two builders do not collide."""
+    compiler = _compiler()
+    folder = Path(cache or os.environ.get(CACHE_VARIABLE) or _own_folder().name)
+    folder.mkdir(parents=True, exist_ok=True)
+    headers = [p.read_text() for p in sorted(HEADERS.glob("*.h"))]
+    identity = [source, *headers, *compiler, _version(compiler[0]), _machine(), *FLAGS]
+    key = hashlib.sha256("\0".join(identity).encode()).hexdigest()[:32]
+    target = folder / f"{key}.so"
+    if target.exists():
+        return target
+    with tempfile.TemporaryDirectory(dir=folder) as scratch:
+        code, library = Path(scratch, "kernel.c"), Path(scratch, "kernel.so")
+        code.write_text(source)
+        for extra in (["-DWITH_MVEC", "-lmvec"], []):  # not every C library has vector mathematics
+            command = [*compiler, *FLAGS, f"-I{HEADERS}", str(code), "-o", str(library), *extra, "-lm", "-Wl,-z,defs"]
+            result = subprocess.run(command, capture_output=True, text=True, check=False)
+            if result.returncode == 0:
+                os.replace(library, target)
+                return target
+    raise RuntimeError(f"{compiler[0]} could not compile a kernel of nocl's:\n{result.stderr[-2000:]}")

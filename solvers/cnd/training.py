@@ -1,0 +1,386 @@
+"""nocl.train: from an optimal control problem to a checked feedback controller.
+
+The default method regresses the controller on optimal answers, and never differentiates through a rollout:
+
+1. a few global optima (cold starts), and from them those of many initial states;
+2. optimal tails from a tube about these trajectories, all by batched DDP on the dynamics that training uses;
+3. regression of u(x, t) on the middle of every interval, so that the controller is feedback in continuous time;
+4. rounds: the states that the controller visits under kicks are solved too and added (DAgger, Ross et al. 2011), until
+   it meets the wanted gap on held-out initial states (after two rounds at least) or the rounds are used up;
+5. V(x, t) by regression on the costs-to-go and their gradients, the costates.
+"""
+
+from __future__ import annotations
+
+import copy
+import os
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from nocl.nets import FeatureNet
+from nocl.ocp import OCP
+from nocl.solvers.cnd.controller import CND
+from nocl.solvers.cnd.features import at_rate, policy_net
+from nocl.solvers.cnd.identity import identity
+from nocl.solvers.cnd.labels import Labels, at_other_rates, tube, visited
+from nocl.solvers.cnd.regress import fit, policy_loss
+from nocl.solvers.cnd.settings import TrainSettings
+from nocl.solvers.cnd.validate import (
+    advice,
+    feasible,
+    gap,
+    held_gap,
+    held_out_optima,
+    kicked_optima,
+    summary,
+    tube_optima,
+    value_scores,
+)
+from nocl.solvers.cnd.value import ValueLabels, on_fine_grid, value_loss, value_net, value_tails
+from nocl.solvers.ddp.bank import SolutionBank, extend
+from nocl.solvers.ddp.global_search import solve_globally
+from nocl.solvers.ddp.solver import DDP, DDPSolution
+from nocl.support import store
+from nocl.support.checks import Array
+from nocl.support.threads import one_thread
+from nocl.translate.torch_functions import to_torch
+
+if TYPE_CHECKING:
+    from nocl.solvers.cnd.paper import PaperSettings
+    from nocl.sysid.identification import LearnedDynamics
+
+__all__ = ["TrainSettings", "train"]
+CHECKPOINT = "training.safetensors"
+VALUE_LARGE = 0.05  # mean |V - J*| / J* that is told
+VALUE_HELD_OUT = 16  # times held_out: a mean of relative errors hangs on the few states that are hard
+LOSSES = 40  # of each regression that the card keeps
+STREAM = 0x6E6F636C  # training's own random numbers: never those of initial_states.sample(n, seed), whatever the seeds
+
+
+def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "default",
+          settings: TrainSettings | PaperSettings | None = None, seed: int = 0,
+          out: str | os.PathLike[str] | None = None, progress: bool | None = None) -> CND:
+    """Train a controller and a value function for all of an OCP's initial states.
+
+    Parameters
+    ----------
+    ocp : OCP
+    dynamics : LearnedDynamics, optional
+        f_theta in place of the exact f; the exact one is then not used anywhere.
+    method : "default" or "paper"
+        "paper" is CND as published: HJB losses through ODE rollouts, see nocl.solvers.cnd.paper.
+    settings : TrainSettings, or PaperSettings with method="paper"
+    seed : int
+        The same seed gives the same controller on the same machine.
+    out : folder, optional
+        Where checkpoints go: a call with the same arguments goes on from the last one.
+    progress : bool, optional
+        Whether to show progress; by default where the terminal is one.
+    """
+    _check(ocp, dynamics, seed, out)
+    if method == "paper":
+        from nocl.solvers.cnd.paper import PaperSettings, train_paper
+
+        chosen = _expect(settings, PaperSettings)
+        checkpoint = None if out is None else Path(out) / CHECKPOINT
+        policy, value, card = train_paper(ocp, dynamics, chosen, seed=seed, progress=progress, checkpoint=checkpoint)
+        return CND(ocp, policy, value, card)
+    if method != "default":
+        raise ValueError(f"train: method is {method!r}; expected 'default' or 'paper'")
+    return _Training(ocp, dynamics, _expect(settings, TrainSettings), seed, out, progress).run()
+
+
+def _check(ocp: OCP, dynamics: LearnedDynamics | None, seed: int, out: str | os.PathLike[str] | None) -> None:
+    if not isinstance(ocp, OCP):
+        raise ValueError(f"train: ocp is a {type(ocp).__name__}; expected a nocl.OCP")
+    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**62:
+        raise ValueError(f"train: seed is {seed!r}; expected a whole number from 0 to 2**62")
+    if out is not None and Path(out).exists() and not Path(out).is_dir():
+        raise ValueError(f"train: out is the file {out}; expected a folder for checkpoints")
+    if dynamics is not None and not hasattr(dynamics, "system"):
+        raise ValueError(f"train: dynamics is a {type(dynamics).__name__}; expected what nocl.identify returns, or "
+                         "None for the exact f")
+    if dynamics is not None and (dynamics.system.nx, dynamics.system.nu) != (ocp.system.nx, ocp.system.nu):
+        raise ValueError(f"train: dynamics has {dynamics.system.nx} states and {dynamics.system.nu} controls, "
+                         f"{ocp.system.name} has {ocp.system.nx} and {ocp.system.nu}: identify that system")
+
+
+def _expect(settings: Any, kind: Any) -> Any:
+    if settings is not None and not isinstance(settings, kind):
+        raise ValueError(f"train: settings is a {type(settings).__name__}; this method takes {kind.__name__}")
+    return settings or kind()
+
+
+class _Training:
+    """One run of the default method; its state between rounds is what a checkpoint holds."""
+
+    def __init__(self, ocp: OCP, dynamics: LearnedDynamics | None, settings: TrainSettings, seed: int,
+                 out: str | os.PathLike[str] | None, progress: bool | None) -> None:
+        self.ocp, self.settings, self.seed = ocp, settings, seed
+        self.learned = dynamics is not None
+        self.f = to_torch(ocp.system.f) if dynamics is None else dynamics
+        self.ddp = DDP(ocp, intervals=settings.intervals, dynamics=dynamics)
+        self.fine = DDP(ocp, intervals=4 * settings.intervals, dynamics=dynamics)
+        self.checkpoint = None if out is None else Path(out) / CHECKPOINT
+        self.hidden_progress = None if progress is None else not progress
+        self.round, self.seconds, self.fitting, self.fitting_cpu, self.evaluations = 0, 0.0, 0.0, 0.0, 0
+        self.history: list[dict[str, Any]] = []
+        self.losses: list[float] = []
+        self.value_card: dict[str, Any] = {}
+
+    def run(self) -> CND:
+        with one_thread():
+            return self._run()
+
+    def _run(self) -> CND:
+        s = self.settings
+        if not self._resume():
+            self._first_labels()
+            self._network()
+        while self.round <= s.rounds and not self._good_enough():
+            if self.round:
+                self._visit()
+            self._regress(s.iterations * (2 if self.round >= max(s.least_rounds, 1) else 1))
+            self._validate()
+            self.round += 1
+            self._save()
+        if (remark := advice(self.history[-1], self.round - 1, s.held_out)) is not None:
+            warnings.warn(f"{self.ocp.system.name}: {remark}", stacklevel=4)
+        value = self._value() if s.value else None
+        return CND(self.ocp, self.net, value, self._card())
+
+    def _first_labels(self) -> None:
+        s, rng = self.settings, self._rng(0)
+        with self._stage("labels", s.starts + 6) as bar:
+            def report(what: str) -> None:
+                bar.set_postfix_str(what, refresh=False)
+                bar.update()
+
+            seeds = solve_globally(self.ddp, self.ocp.initial_states.sample(s.seeds, rng), starts=s.starts, seed=rng,
+                                   report=report).best
+            self.bank = SolutionBank.of(self.ddp, seeds)
+            if s.states:
+                more = extend(self.ddp, self.bank, self.ocp.initial_states.sample(s.states, rng))
+                self.bank = SolutionBank.of(self.ddp, type(more).join([seeds, more]))
+            parts = [self.bank.solution] + ([tube(self.ddp, self.bank, s.tails, s.width, rng)] if s.tails else [])
+            self.labels = Labels.join([self._labels(p, rng) for p in parts])
+            self.first = len(self.labels)
+
+    def _labels(self, solution: DDPSolution, rng: np.random.Generator) -> Labels:
+        """Labels of the continuous controls, and with control_dt of held ones."""
+        parts = [Labels.of(solution, self.f, self._unit())]
+        if self.settings.control_dt:
+            parts += [Labels.held(solution, self._unit()), at_other_rates(self.ddp, solution, self._unit(), rng)]
+        return Labels.join(parts)
+
+    def _unit(self) -> float:
+        """A usual cost from an initial state."""
+        return float(np.median(np.abs(self.bank.solution.cost)))
+
+    def _network(self) -> None:
+        """The policy's networks, scaled by the first labels."""
+        with _seeded(self.seed):
+            self.net, self.inverse = policy_net(self.ocp, self.labels[: self.first], self.settings.hidden,
+                                                self.settings.control_dt)
+        self.policy = at_rate(self.net, 0.0) if self.settings.control_dt else self.net  # in continuous time
+
+    def _visit(self) -> None:
+        s, rng = self.settings, self._rng(self.round)
+        with self._stage(f"round {self.round}: visited states", 1) as bar:
+            solved = visited(self.ddp, self.bank, self.policy, self.f, s.visits, s.kick, rng)
+            self.labels = Labels.join([self.labels, self._labels(solved, rng)])
+            bar.update()
+
+    def _regress(self, iterations: int) -> None:
+        s = self.settings
+        loss = policy_loss(self.ocp, self.net, self.inverse, self.labels)
+        with self._stage(f"round {self.round}: controller", iterations, fits=True) as bar:
+            report = _Reporter(bar, iterations)
+            fit(self.net, loss, len(self.labels), iterations=iterations, batch=s.batch, lr=s.lr,
+                seed=self.seed + self.round, report=report)
+        self.losses = report.kept
+
+    def _validate(self) -> None:
+        """The gap to the optimum as continuous-time feedback, on initial states that no label starts from, and
+        on states of kicked rollouts."""
+        s, rng = self.settings, self._rng(1_000_000)
+        with self._stage("held-out states", 1) as bar:
+            solvers, x0 = (self.ddp, self.fine, self.bank), self.ocp.initial_states.sample(s.held_out, rng)
+            starts = held_out_optima(*solvers, x0)
+            tails = kicked_optima(*solvers, self.policy, self.f, 4 * s.held_out, s.kick, rng)
+            row = {"round": self.round, "labels": len(self.labels), "loss": self.losses,
+                   "unsolved": s.held_out - len(starts),
+                   **summary(gap(self.ocp, self.policy, self.f, starts), "gap"),
+                   **summary(gap(self.ocp, self.policy, self.f, tails, self._unit()), "kicked")}
+            if s.control_dt:
+                best = extend(self.ddp, self.bank, starts.x[:, 0])
+                held = at_rate(self.net, self.ocp.horizon / s.intervals)
+                row |= summary(held_gap(self.ocp, held, self.f, best), "held")
+            bar.set_postfix_str(f"gap {100 * row['gap_median']:.3f} %, p95 {100 * row['gap_p95']:.3f} %, "
+                                f"kicked {100 * row['kicked_median']:.3f} %")
+            bar.update()
+        self.history.append(row)
+
+    def _good_enough(self) -> bool:
+        if self.round <= self.settings.least_rounds:
+            return False
+        last, s = self.history[-1], self.settings
+        return bool(last["gap_median"] <= s.gap_median and last["gap_p95"] <= s.gap_p95)
+
+    def _value(self) -> FeatureNet:
+        """V, fitted again on more labels where the held-out states ask for it; the best fit is kept."""
+        s, rng, losses, tried = self.settings, self._rng(2_000_000), list[float](), list[float]()
+        labels, optima = ValueLabels.of(on_fine_grid(self.fine, self.bank.solution)), self._value_optima()
+        for attempt in range(s.value_rounds):
+            labels = ValueLabels.join([labels, self._value_labels(rng)])
+            if attempt == 0:
+                with _seeded(self.seed + 1):
+                    net = value_net(self.ocp, labels, s.hidden)
+            losses += self._fit_value(net, labels, attempt)
+            scores = value_scores(self.ocp, net, self.policy, self.f, optima)
+            worst = float(np.max([scores[f"{name}_error"] for name in optima]))
+            tried.append(worst if np.isfinite(worst) else np.inf)
+            if len(tried) == 1 or tried[-1] < min(tried[:-1]):
+                best, weights = scores, copy.deepcopy(net.state_dict())
+            if tried[-1] <= s.value_error:
+                break
+        net.load_state_dict(weights)
+        if not min(tried) <= VALUE_LARGE:
+            warnings.warn(f"{self.ocp.system.name}: V is {100 * min(tried):.2g} % off in the mean on held-out states; "
+                          "expected less than 5 %: try TrainSettings with more value_tails or value_iterations, wider "
+                          "layers, or a narrower tube (width)", stacklevel=5)
+        judged = {f"{name}_judged": len(held) for name, held in optima.items()}
+        self.value_card = {"loss": losses, "labels": len(labels), "tried": tried, **judged, **best}
+        return net
+
+    def _value_optima(self) -> dict[str, DDPSolution]:
+        """What V is told by: initial states, states of the tube, and states of kicked rollouts, solved anew; those that
+        can hold the path constraints, where there are any."""
+        s, rng = self.settings, self._rng(3_000_000)
+        solvers, n = (self.ddp, self.fine, self.bank), VALUE_HELD_OUT * s.held_out
+        with self._stage("held-out states for V", 3) as bar:
+            sets = {"initial": held_out_optima(*solvers, self.ocp.initial_states.sample(n, rng))}
+            bar.update()
+            sets["tube"] = tube_optima(*solvers, self.policy, self.f, n, s.width, rng)
+            bar.update()
+            sets["tails"] = kicked_optima(*solvers, self.policy, self.f, n, s.kick, rng)
+            bar.update()
+        held = {name: feasible(self.ocp, optima) for name, optima in sets.items()}
+        return {name: optima for name, optima in held.items() if len(optima)} or sets
+
+    def _value_labels(self, rng: np.random.Generator) -> ValueLabels:
+        s = self.settings
+        with self._stage("value labels", 1) as bar:
+            found = value_tails(self.ddp, self.bank, self.policy, self.f, initial=s.value_initial, tails=s.value_tails,
+                                visits=s.value_visits, width=s.width, kick=s.kick, rng=rng)
+            labels = ValueLabels.of(on_fine_grid(self.fine, found))
+            bar.update()
+        return labels
+
+    def _fit_value(self, net: FeatureNet, labels: ValueLabels, attempt: int) -> list[float]:
+        s = self.settings
+        iterations = s.value_iterations * (2 if attempt else 1)
+        loss = value_loss(net.float(), labels, self.bank.scale)
+        with self._stage("value function" + (", once more" if attempt else ""), iterations, fits=True) as bar:
+            report = _Reporter(bar, iterations)
+            fit(net, loss, len(labels), iterations=iterations, batch=s.batch, lr=s.lr, seed=self.seed + attempt,
+                report=report)
+        return report.kept
+
+    def _card(self) -> dict[str, Any]:
+        last = self.history[-1]
+        return {"method": "default", "dynamics": "learned" if self.learned else "exact", "seed": self.seed,
+                **{name: last[name] for name in ("gap_median", "gap_p95", "kicked_median", "kicked_p95", "unsolved")},
+                "seconds": round(self.seconds, 1),
+                "fitting_seconds": round(self.fitting, 1),  # of these, fits of networks; the others solve problems
+                "fitting_cpu_seconds": round(self.fitting_cpu, 1),
+                "dynamics_evaluations": self._evaluations(),
+                "settings": asdict(self.settings), "history": self.history, "value": self.value_card}
+
+    def _evaluations(self) -> int:
+        """Of f, in rollouts of DDP, one for each state; those before a checkpoint included."""
+        return self.evaluations + sum(ddp.evaluations["rollout"] for ddp in (self.ddp, self.fine))
+
+    @contextmanager
+    def _stage(self, name: str, total: int, fits: bool = False) -> Iterator[tqdm[Any]]:
+        start, cpu = time.perf_counter(), time.process_time()
+        with tqdm(total=total, desc=name, disable=self.hidden_progress, leave=True) as bar:
+            yield bar
+        took = time.perf_counter() - start
+        self.seconds, self.fitting = self.seconds + took, self.fitting + took * fits
+        self.fitting_cpu += (time.process_time() - cpu) * fits
+
+    def _rng(self, stage: int) -> np.random.Generator:
+        return np.random.default_rng([self.seed, stage, STREAM])
+
+    def _identity(self) -> str:
+        return identity(self.ocp, self.settings, self.seed, self.f)
+
+    def _save(self) -> None:
+        if self.checkpoint is None:
+            return
+        state = {"policy": self.net.state_dict(), "labels": _tensors(vars(self.labels)),
+                 "bank": _tensors({k: v for k, v in vars(self.bank.solution).items() if k != "message"})}
+        meta = {"identity": self._identity(), "round": self.round, "history": self.history, "seconds": self.seconds,
+                "fitting": self.fitting, "fitting_cpu": self.fitting_cpu,
+                "first": self.first, "evaluations": self._evaluations()}
+        self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
+        store.save_checkpoint(self.checkpoint, state, meta)
+
+    def _resume(self) -> bool:
+        """Take up the checkpoint of the same run, where there is one; others are left aside and overwritten."""
+        if self.checkpoint is None or not self.checkpoint.exists():
+            return False
+        state, meta = store.load_checkpoint(self.checkpoint)
+        if meta["identity"] != self._identity():
+            return False
+        self.labels = Labels(**_arrays(state["labels"]))
+        self.bank = SolutionBank.from_arrays(self.ddp, _arrays(state["bank"]))
+        self.round, self.history, self.first = meta["round"], meta["history"], meta["first"]
+        self.seconds, self.fitting, self.fitting_cpu = meta["seconds"], meta["fitting"], meta["fitting_cpu"]
+        self.evaluations = meta.get("evaluations", 0)
+        self._network()
+        self.net.double().load_state_dict(state["policy"])
+        self.net.eval().requires_grad_(False)
+        return True
+
+
+class _Reporter:
+    """Told the loss of each iteration: moves the bar, and keeps LOSSES means over as many stretches."""
+
+    def __init__(self, bar: tqdm[Any], iterations: int) -> None:
+        self.bar, self.every, self.kept = bar, max(iterations // LOSSES, 1), list[float]()
+        self.recent: list[float] = []
+
+    def __call__(self, loss: float) -> None:
+        self.bar.update()
+        self.recent.append(loss)
+        if len(self.recent) == self.every:
+            self.kept.append(float(f"{np.mean(self.recent):.3g}"))
+            self.recent = []
+            self.bar.set_postfix_str(f"loss {self.kept[-1]:.2e}", refresh=False)
+
+
+@contextmanager
+def _seeded(seed: int) -> Iterator[None]:
+    """torch's own generator at a seed, and back to where it was afterwards."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        yield
+
+
+def _tensors(arrays: dict[str, Any]) -> dict[str, torch.Tensor]:
+    return {k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in arrays.items() if v is not None}
+
+
+def _arrays(tensors: dict[str, torch.Tensor]) -> dict[str, Array]:
+    return {k: v.numpy() for k, v in tensors.items()}

@@ -1,0 +1,193 @@
+"""A bank of solutions from t = 0: what lies near (x, t) is a guess for problems there, a feedback and a value."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import KDTree
+
+from nocl.solvers.ddp.solver import DDP, DDPSolution
+from nocl.support import checks
+from nocl.support.checks import Array
+
+Rows = NDArray[np.int64]
+FILE = "bank.safetensors"
+KIND = "solution bank"
+EQUAL = 1e-9  # of the scale: states closer than this are the same
+
+
+@dataclass(frozen=True, eq=False)
+class SolutionBank:
+    """Solutions on [0, T], one a row, as guesses for other problems (x0, t0)."""
+
+    solution: DDPSolution
+    scale: Array  # [nx], one unit of distance in each state
+
+    def __len__(self) -> int:
+        return len(self.solution)
+
+    @staticmethod
+    def of(ddp: DDP, solution: DDPSolution) -> SolutionBank:
+        """A bank of the solutions that succeeded; states are compared in units of their spread along them."""
+        if (solution.t[:, 0] != 0).any():
+            raise ValueError(f"a bank holds solutions from t0 = 0; got t0 up to {solution.t[:, 0].max():g}: solve them "
+                             "from t0 = 0")
+        kept = solution[solution.success]
+        if not len(solution):
+            raise ValueError(f"a bank of {ddp.ocp.system.name} got no solutions; expected at least one")
+        if not len(kept):
+            raise ValueError(f"no problem of {ddp.ocp.system.name} was solved ({solution.message[0]}): check the "
+                             "horizon, the bounds and the costs, or give guesses of your own to DDP.solve(x0, u=...)")
+        return SolutionBank(kept, spread(ddp, kept))
+
+    @staticmethod
+    def from_arrays(ddp: DDP, arrays: dict[str, Any]) -> SolutionBank:
+        """The bank of a solution's arrays, as a checkpoint keeps them."""
+        return SolutionBank.of(ddp, _solution(arrays))
+
+    def add(self, solution: DDPSolution) -> SolutionBank:
+        """A bank with these solutions too, those that succeeded; of two from the same state the cheaper stays."""
+        grid = self.solution.u.shape[1:]
+        if solution.u.shape[1:] != grid or (solution.t != self.solution.t[0]).any():
+            raise ValueError(f"the bank's solutions have controls {grid} on [0, {self.horizon:g}]; got controls "
+                             f"{solution.u.shape[1:]} from t0 up to {solution.t[:, :1].max(initial=0):g}: solve them "
+                             "by the same DDP, from t0 = 0")
+        joined = DDPSolution.join([_plain(self.solution), _plain(solution[solution.success])])
+        order = np.argsort(joined.cost, kind="stable")
+        state = np.round(joined.x[order, 0] / (EQUAL * self.scale))
+        kept = order[np.sort(np.unique(state, axis=0, return_index=True)[1])]
+        return SolutionBank(joined[np.sort(kept)], self.scale)
+
+    def save(self, folder: str | os.PathLike[str]) -> Path:
+        """Write folder/bank.safetensors, data only, atomically."""
+        from nocl.support import store
+
+        arrays = {name: value for name, value in self.solution.arrays().items() if name != "message"}
+        return store.save_checkpoint(Path(folder) / FILE, {"solution": arrays, "scale": self.scale}, {"kind": KIND})
+
+    @staticmethod
+    def load(folder: str | os.PathLike[str]) -> SolutionBank:
+        """The bank that `save` wrote, bit by bit; ValueError for a missing, truncated, altered or foreign file."""
+        from nocl.support import store
+
+        path = Path(folder) / FILE
+        if not path.is_file():
+            raise ValueError(f"{path} does not exist; expected a folder that SolutionBank.save wrote: check the path")
+        state, meta = store.load_checkpoint(path)
+        if meta.get("kind") != KIND:
+            raise ValueError(f"{path} is no solution bank; expected a file of SolutionBank.save: name the right folder")
+        return SolutionBank(_solution(state["solution"]), state["scale"])
+
+    def interpolate(self, x: ArrayLike, t: ArrayLike = 0.0) -> tuple[Array, Array, Array]:
+        """(u, V, V_x) at states x [B, nx] and times t [B]: the nearest solution's, with u and V to first order in the
+        distance to it, u not clipped; V to second order where the bank has V_xx."""
+        rows = np.atleast_2d(np.asarray(x, dtype=np.float64))
+        times = np.broadcast_to(np.asarray(t, dtype=np.float64), len(rows))
+        near, s = self.nearest(rows, times)[:, 0], self.solution
+        k = self._interval(times)
+        away = rows - self.states(near, times[:, None])[:, 0]
+        part = times * s.u.shape[1] / self.horizon - k
+
+        def between(value: Array) -> Array:
+            share = part.reshape(-1, *[1] * (value.ndim - 2))
+            return (1 - share) * value[near, k] + share * value[near, k + 1]
+
+        V, V_x = between(s.V), between(s.V_x)
+        u = s.u[near, k] + np.einsum("bij,bj->bi", s.gain[near, k], away)
+        V = V + np.einsum("bi,bi->b", V_x, away)
+        if s.V_xx is not None:
+            bend = np.einsum("bij,bj->bi", between(s.V_xx), away)
+            V, V_x = V + np.einsum("bi,bi->b", bend, away) / 2, V_x + bend
+        return u, V, V_x
+
+    def nearest(self, x: Array, t: ArrayLike = 0.0, count: int = 1) -> Rows:
+        """The `count` rows whose states at t (at the last node before it) are nearest to x [B, nx], the nearest first.
+
+        t: a number or [B]. Returns [B, count], fewer columns where the bank has fewer rows.
+        """
+        columns = list(range(1, min(count, len(self)) + 1))
+        found = np.empty((len(x), len(columns)), dtype=np.int64)
+        interval = np.broadcast_to(self._interval(t), len(x))
+        for k in np.unique(interval):
+            here = interval == k
+            tree = KDTree(self.solution.x[:, k] / self.scale)
+            found[here] = tree.query(x[here] / self.scale, columns)[1]
+        return found
+
+    def guess(self, rows: Rows, t0: ArrayLike = 0.0) -> dict[str, Array]:
+        """What DDP.solve starts from: solutions `rows` [B] resampled onto their own [t0, T], as u, x and gain."""
+        start = np.broadcast_to(np.asarray(t0, dtype=np.float64), rows.shape)
+        part = np.arange(self.solution.u.shape[1] + 1) / self.solution.u.shape[1]
+        return self._along(rows, start[:, None] + (self.horizon - start)[:, None] * part)
+
+    def late(self, rows: Rows, start: Array, held: NDArray[np.bool_]) -> dict[str, Array]:
+        """Guesses from t = 0 of what solutions `rows` [B] do from times `start` [B] on: as fast, and held at their last
+        node, where `held`; else stretched to the whole horizon."""
+        t = self.horizon * np.arange(self.solution.u.shape[1] + 1) / self.solution.u.shape[1]
+        stretched = start[:, None] + (1 - start / self.horizon)[:, None] * t
+        return self._along(rows, np.where(held[:, None], np.minimum(start[:, None] + t, self.horizon), stretched))
+
+    def _along(self, rows: Rows, times: Array) -> dict[str, Array]:
+        k, row = self._interval(times[:, :-1] + np.diff(times) / 2), rows[:, None]
+        return {"u": self.solution.u[row, k], "x": self.states(rows, times), "gain": self.solution.gain[row, k]}
+
+    def states(self, rows: Rows, t: Array) -> Array:
+        """x of solutions rows [B] at times t [B, n], linear between nodes: [B, n, nx]."""
+        k, row = self._interval(t), rows[:, None]
+        part = (t * self.solution.u.shape[1] / self.horizon - k)[..., None]
+        return (1 - part) * self.solution.x[row, k] + part * self.solution.x[row, k + 1]
+
+    @property
+    def horizon(self) -> float:
+        """T."""
+        return float(self.solution.t[0, -1])
+
+    def _interval(self, t: ArrayLike) -> Rows:
+        K = self.solution.u.shape[1]
+        return np.clip((np.asarray(t) * K / self.horizon).astype(np.int64), 0, K - 1)
+
+
+def spread(ddp: DDP, solution: DDPSolution) -> Array:
+    """The states' standard deviations along solutions [nx], at least 5 % of X."""
+    box = np.asarray(ddp.ocp.system.ubx) - ddp.ocp.system.lbx
+    return np.asarray(np.maximum(solution.x.std(axis=(0, 1)), 0.05 * box))
+
+
+def extend(ddp: DDP, bank: SolutionBank, x0: ArrayLike, neighbours: int = 3, t0: ArrayLike = 0.0) -> DDPSolution:
+    """Solve new problems (x0 [B, nx], t0) from the nearest solutions of a bank: the best of `neighbours` starts each.
+    """
+    if neighbours < 1:
+        raise ValueError(f"neighbours is {neighbours}; expected at least 1")
+    rows, _ = checks.states(x0, ddp.ocp.system.nx, ddp.ocp.system.name)
+    best: DDPSolution | None = None
+    for near in bank.nearest(rows, t0, count=neighbours).T:
+        solution = ddp.solve(rows, t0, **bank.guess(near, t0))
+        best = solution if best is None else better(best, solution)
+    assert best is not None
+    return best
+
+
+def better(a: DDPSolution, b: DDPSolution) -> DDPSolution:
+    """The cheaper of two solutions of each problem."""
+    swap = b.cost < a.cost
+    merged: dict[str, Any] = {}
+    for name, value in vars(a).items():
+        other = getattr(b, name)
+        merged[name] = None if value is None or other is None else np.where(
+            swap.reshape(-1, *[1] * (value.ndim - 1)), other, value)
+    return DDPSolution(**merged)
+
+
+def _solution(arrays: dict[str, Any]) -> DDPSolution:
+    """A bank's solutions from their arrays without the messages."""
+    return DDPSolution.of_arrays({**arrays, "message": np.full(len(arrays["cost"]), "converged")})
+
+
+def _plain(solution: DDPSolution) -> DDPSolution:
+    """Without V_xx: a bank may get solutions with and without."""
+    return replace(solution, V_xx=None)

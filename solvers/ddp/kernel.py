@@ -1,0 +1,218 @@
+"""The generated half of the DDP kernel: from an OCP, and f_theta where it is learned, to C (see csrc/ddp.h)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import combinations_with_replacement, pairwise
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from nocl.ocp import OCP
+from nocl.support.checks import Array
+from nocl.translate.kernels import emit
+
+STRAIGHT = 5_000  # products in the chain rule through a step, up to which it is straight-line code
+ACTIVATION_KINDS = {"sine": 0, "tanh": 1, "relu": 2, "silu": 3}  # as csrc/mlp.h numbers them
+Columns = list[ca.SX]
+_STEP = """#define NZ (N + M)
+static const double reach[4] = {0, 0.5, 0.5, 1}, share[4] = {1. / 6, 1. / 3, 1. / 3, 1. / 6};
+"""
+
+
+def pack_weights(net: Any) -> Array:
+    """All networks' weights in one array, in the order that csrc/mlp.h reads; one number unused before them."""
+    parts = []
+    for mlp in net.nets:
+        for layer in mlp.body:
+            if hasattr(layer, "weight"):
+                parts += [layer.weight, layer.bias]
+        if mlp.skip is not None:
+            parts.append(mlp.skip.weight)
+    return np.concatenate([np.zeros(1), *(p.detach().double().cpu().numpy().ravel() for p in parts)])
+
+
+def ddp_source(ocp: OCP, net: Any = None) -> str:
+    """The generated part of the kernel: what csrc/ddp.h lists, for the exact f or for f_theta's FeatureNet."""
+    x, u = ocp.system.x, ocp.system.u
+    stage = _Stage(ocp, net)
+    nets, networks = stage.nets, stage.networks
+    sizes = {"N": x.numel(), "M": u.numel(), "NET": networks.numel(), "TAPE": sum(n.tape for n in nets),
+             "NV": stage.v.numel(), "BEND": stage.bend.numel(), "NJ": stage.J.nnz(), "NW": stage.W.nnz()}
+    lines = ['#include "lanes.h"', *(['#include "mlp.h"'] if nets else []),
+             *(f"#define {name} {value}" for name, value in sizes.items()), _STEP, _networks(x, u, nets),
+             emit("field", [x, u, networks], [ca.densify(stage.rhs)]),
+             emit("stage_jacobian", [x, u, networks], [stage.J.T]),
+             emit("network_weights", [x, u, networks, stage.mu], [stage.v]),
+             emit("stage_hessian", [x, u, networks, stage.bend, stage.mu], [stage.W]),
+             _chain(x.numel(), u.numel(), stage.J.sparsity(), stage.W.sparsity())]
+    G = ocp.terminal
+    H, g = ca.hessian(G, x)
+    lines.append(emit("terminal", [x], [ca.densify(G), ca.densify(g), ca.densify(H)]))
+    lines.append('#include "ddp.h"\n')
+    return "\n".join(lines)
+
+
+class _Net:
+    """One network as symbols: values and slopes along q directions; Hessian and adjoint for weights on the values.
+
+    The directions are the variables in z that its features depend on, or the features where those are fewer.
+    """
+
+    def __init__(self, mlp: Any, phi: ca.SX, z: ca.SX, number: int) -> None:
+        self.mlp, self.phi, out = mlp, ca.densify(phi), mlp.sizes[-1]
+        slopes = ca.jacobian(phi, z)
+        variables = sorted(set(slopes.sparsity().get_triplet()[1]))
+        few = len(variables) < phi.numel()
+        self.directions = z[variables] if few else phi
+        self.seeds = ca.densify(ca.jacobian(phi, z)[:, variables] if few else ca.SX.eye(phi.numel()))
+        self.q = q = self.directions.numel()
+        self.symbols: ca.SX = ca.SX.sym(f"net{number}", 1 + q, out)  # a column for each output: value, slopes
+        along = ca.jacobian(self.directions, z)
+        self.y: ca.SX = self.symbols[0, :].T
+        self.slopes: ca.SX = self.symbols[1:, :].T @ along
+        H, s = ca.SX.sym(f"H{number}", q * (q + 1) // 2), ca.SX.sym(f"s{number}", phi.numel())
+        self.bend = ca.vertcat(H, s)
+        through = ca.hessian(ca.dot(s, phi), z)[0]
+        self.hessian = along.T @ _symmetric(q, ca.vertsplit(H)) @ along + through  # of v'y in z, v fixed
+        self.tape = (q + 2) * sum(mlp.sizes[1:-1])
+        self.weights = sum((a + 1) * b for a, b in pairwise(mlp.sizes)) + (mlp.skip is not None) * phi.numel() * out
+
+
+def _symmetric(q: int, upper: Columns) -> ca.SX:
+    """A matrix from its upper triangle, row by row."""
+    H = ca.SX(q, q)
+    for (i, j), entry in zip(combinations_with_replacement(range(q), 2), upper, strict=True):
+        H[i, j] = H[j, i] = entry
+    return H
+
+
+class _Stage:
+    """(xdot, L) at a stage, its Jacobian and the weighted Hessian's lower triangle, with the networks as symbols."""
+
+    def __init__(self, ocp: OCP, net: Any) -> None:
+        x, u = ocp.system.x, ocp.system.u
+        z, self.mu = ca.vertcat(x, u), ca.SX.sym("mu", x.numel() + 1)
+        phi = net.inputs.call([x, u]) if net is not None and net.nets else []
+        nets = zip(net.nets, phi, strict=True) if phi else ()
+        self.nets = [_Net(mlp, p, z, i) for i, (mlp, p) in enumerate(nets)]
+        self.networks = ca.vertcat(*(ca.vec(n.symbols) for n in self.nets))
+        self.bend = ca.vertcat(*(n.bend for n in self.nets))
+        xdot: Any = ocp.system.equations if net is None else net.outputs(x, u, *(n.y for n in self.nets))
+        self.rhs = ca.vertcat(xdot, ocp.L_soft(x, u))
+        y, yz = ca.vertcat(*(n.y for n in self.nets)), ca.vertcat(*(n.slopes for n in self.nets))
+        self.J, scalar = ca.jacobian(self.rhs, z), ca.dot(self.mu, self.rhs)
+        H, self.v = ca.hessian(scalar, z)[0], ca.SX(0, 1)
+        if self.nets:
+            self.J += ca.jacobian(self.rhs, y) @ yz
+            Hyy, self.v = ca.hessian(scalar, y)
+            cross = ca.jacobian(ca.gradient(scalar, z), y) @ yz
+            H = H + cross + cross.T + yz.T @ Hyy @ yz + sum(n.hessian for n in self.nets)
+        self.v, self.W = ca.densify(self.v), ca.tril(H)
+
+
+def _chain(n: int, m: int, J: ca.Sparsity, W: ca.Sparsity) -> str:
+    """stage_adjoints() and step_derivatives(): straight-line code while that is small, else loops over sparse rows."""
+    S = _closure(n, m, J)
+    JS, WS = (_dense(p).astype(int) @ S.astype(int) for p in (J, ca.Sparsity.unite(W, W.T)))
+    terms = 3 * int(JS.sum() + WS.sum() + S.sum(axis=1) @ (WS > 0).sum(axis=1) / 2)  # the first stage has S = 1
+    return "\n".join(_straight_chain(n, m, J, W)) if terms <= STRAIGHT else _looped_chain(n, m, J, W, S)
+
+
+def _closure(n: int, m: int, J: ca.Sparsity) -> NDArray[np.bool_]:
+    """The pattern of d(x at a stage, u)/d(x, u), closed under multiplication by J."""
+    A = np.zeros((n + m, n + m), dtype=bool)
+    A[:n] = _dense(J)[:n]
+    S = A | np.eye(n + m, dtype=bool)
+    while True:
+        wider = S | (A.astype(int) @ S.astype(int) > 0)
+        if (wider == S).all():
+            return S
+        S = wider
+
+
+def _dense(pattern: ca.Sparsity) -> NDArray[np.bool_]:
+    dense: NDArray[np.bool_] = ca.DM(pattern, 1.0).full() != 0
+    return dense
+
+
+def _looped_chain(n: int, m: int, J: ca.Sparsity, W: ca.Sparsity, S: NDArray[np.bool_]) -> str:
+    """The tables that csrc/chain.h reads, and itself."""
+    number = np.full(W.shape, -1)
+    rows, columns = W.get_triplet()
+    number[rows, columns] = number[columns, rows] = np.arange(W.nnz())
+    whole = number >= 0
+    T = whole.astype(int) @ S.astype(int) > 0
+    lines = [_table(f"{name}_{part}", values) for name, pattern in (("J", _dense(J)), ("W", whole), ("S", S), ("T", T))
+             for part, values in (("ROW", np.r_[0, np.cumsum(pattern.sum(axis=1))]), ("COL", np.nonzero(pattern)[1]))]
+    return "\n".join([*lines, _table("W_AT", number[whole]), f"#define S_ROW_END {S.sum()}", '#include "chain.h"', ""])
+
+
+def _table(name: str, values: NDArray[np.int64]) -> str:
+    return f"static const int {name}[] = {{{', '.join(map(str, values.tolist() or [0]))}}};"
+
+
+def _straight_chain(n: int, m: int, J_pattern: ca.Sparsity, W_pattern: ca.Sparsity) -> list[str]:
+    """The chain rule through one RK4 step, with the stages' Jacobians and Hessians as symbols (see csrc/ddp.h)."""
+    nz, nj, nw = n + m, J_pattern.nnz(), W_pattern.nnz()
+    reach, share = (0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)
+    h, lam = ca.SX.sym("h"), ca.SX.sym("lam", n)
+    Js, Ws = ca.SX.sym("J", 4 * nj), ca.SX.sym("W", 4 * nw)
+    J = [ca.SX(J_pattern.T, Js[i * nj:(i + 1) * nj]).T for i in range(4)]
+    W = [ca.tril2symm(ca.SX(W_pattern, Ws[i * nw:(i + 1) * nw])) for i in range(4)]
+    mu = [ca.SX()] * 4
+    for i in reversed(range(4)):
+        through = 0 if i == 3 else reach[i + 1] * h * (J[i + 1][:, :n].T @ mu[i + 1])
+        mu[i] = ca.vertcat(h * share[i] * lam + through, h * share[i])
+    identity = ca.SX.eye(nz)
+    S, F, cost, H = identity, identity[:n, :], ca.SX(1, nz), ca.SX(nz, nz)
+    for i in range(4):
+        slope = J[i][:n, :] @ S
+        F += h * share[i] * slope
+        cost += h * share[i] * (J[i][n, :] @ S)
+        H += S.T @ W[i] @ S
+        if i < 3:
+            S = identity + reach[i + 1] * h * ca.vertcat(slope, ca.SX(m, nz))
+    J_in = [Js[i * nj:(i + 1) * nj] for i in (1, 2, 3)]
+    return [emit("stage_adjoints", [*J_in, lam, h], [ca.densify(ca.vertcat(*mu))]),
+            emit("step_derivatives", [Js, Ws, h], [ca.densify(F.T), ca.densify(cost), ca.densify(H)])]
+
+
+def _networks(x: ca.SX, u: ca.SX, nets: Sequence[_Net]) -> str:
+    """C of network_values(), network_slopes() and network_bend(): features by generated code, then each MLP."""
+    values, slopes, bend = _Body(), _Body(), _Body()
+    emitted, weight, net, tape, v, bent = [], 1, 0, 0, 0, 0
+    for g, n in enumerate(nets):
+        d, C, sizes = n.phi.numel(), n.q + 1, n.mlp.sizes
+        emitted += [emit(f"features{g}", [x, u], [n.phi]),
+                    emit(f"seeds{g}", [x, u], [ca.vec(ca.horzcat(n.phi, n.seeds).T)])]
+        widest, skip = max(sizes), int(n.mlp.skip is not None)
+        shape = f"{{{', '.join(map(str, sizes))}}}"
+        common = f"weights + {weight}, (const int[]){shape}, {len(sizes) - 1}"
+        kind = ACTIVATION_KINDS[n.mlp.activation]
+        values.add(f"lane phi[{d}], a[{widest}], b[{widest}]; features{g}(x, u, phi);",
+                   f"mlp_values({common}, {kind}, {skip}, {C}, phi, a, b, net + {net});")
+        slopes.add(f"lane phi[{d * C}], a[{widest * C}], b[{widest * C}]; seeds{g}(x, u, phi);",
+                   f"mlp_slopes({common}, {kind}, {skip}, {C}, phi, tape + {tape}, a, b, net + {net});")
+        bend.add(f"lane a[{widest}], b[{widest}], work[{widest}], *H = bend + {bent};",
+                 f"mlp_bend({common}, {skip}, {n.q}, v + {v}, tape + {tape}, a, b, work, H, H + {n.bend.numel() - d});")
+        weight, net, tape = weight + n.weights, net + n.symbols.numel(), tape + n.tape
+        v, bent = v + sizes[-1], bent + n.bend.numel()
+    return "\n".join([*emitted, values.function("network_values", "const lane *x, const lane *u, lane *net"),
+                      slopes.function("network_slopes", "const lane *x, const lane *u, lane *net, lane *tape"),
+                      bend.function("network_bend", "const lane *v, const lane *tape, lane *bend")])
+
+
+class _Body:
+    """The blocks of a C function, one a network."""
+
+    def __init__(self) -> None:
+        self.blocks: list[str] = []
+
+    def add(self, *lines: str) -> None:
+        self.blocks.append("    {\n" + "".join(f"        {line}\n" for line in lines) + "    }\n")
+
+    def function(self, name: str, arguments: str) -> str:
+        return f"static void {name}(const double *weights, {arguments})\n{{\n{''.join(self.blocks)}}}\n"

@@ -1,0 +1,332 @@
+"""Batched control-limited differential dynamic programming with exact second derivatives, in C generated from CasADi.
+
+Notation: z = (x, u); K RK4 intervals on [t0, T], u held on each, as NMPC has it; a problem of the batch is a pair
+(x0, t0). V, V_x, V_xx are the cost-to-go at the nodes and its derivatives, u + gain (x' - x) is the locally optimal
+feedback.
+
+Sources: Jacobson and Mayne, Differential Dynamic Programming (1970); Tassa, Mansard and Todorov, Control-limited
+differential dynamic programming, ICRA 2014.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections import Counter
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from nocl.ocp import OCP
+from nocl.solvers.ddp.batch import Batch, DDPSolution, Job, Rows, assembled, pieces
+from nocl.solvers.ddp.kernel import ddp_source, pack_weights
+from nocl.solvers.ddp.without_compiler import ddp_kernel
+from nocl.support import checks
+from nocl.support.checks import Array
+from nocl.support.compiler import fingerprint
+from nocl.support.pool import Journal, Pool, stream
+
+if TYPE_CHECKING:
+    from nocl.sysid.identification import LearnedDynamics
+
+STAGES = 4  # evaluations of f in an RK4 step
+GROWTH, DECAY = 4.0, 2.0  # of mu, after a failure and a success: against 8 and 8, twice as many wild starts converge
+
+
+@dataclass(frozen=True)
+class DDPSettings:
+    """When to stop, and how steps are damped."""
+
+    max_iterations: int = 200
+    tolerance: float = 1e-10  # stop when the predicted decrease of J is below tolerance * |J| + 1e-15
+    smallest_step: float = 2.0**-12  # of the line search
+    damping: float = 1e-4  # first mu added to Quu where a sweep or a line search fails
+    largest_damping: float = 1e8  # give up above it
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.max_iterations, int) or self.max_iterations < 1:
+            raise ValueError(f"DDPSettings: max_iterations is {self.max_iterations!r}; expected an integer >= 1")
+        for name in ("tolerance", "smallest_step", "damping", "largest_damping"):
+            checks.number(getattr(self, name), name, "DDPSettings", positive=True)
+        if self.smallest_step > 1 or self.damping > self.largest_damping:
+            raise ValueError(f"DDPSettings: smallest_step is {self.smallest_step}, damping {self.damping}, "
+                             f"largest_damping {self.largest_damping}; expected smallest_step <= 1 and damping below")
+
+
+class DDP:
+    """Solve batches of an OCP's problems from any (x0, t0); path constraints enter as the OCP's penalty.
+
+    Parameters
+    ----------
+    ocp : OCP
+    intervals : int
+        K, the number of RK4 steps and held controls on [t0, T].
+    dynamics : LearnedDynamics, optional
+        f_theta in place of the exact f; its networks' derivatives are generated C too.
+    threads : int, optional
+        Default: all cores.
+    cache : folder for compiled kernels, optional
+        Default: the folder that NOCL_CACHE names, or else one that goes with the process.
+    """
+
+    def __init__(self, ocp: OCP, *, intervals: int = 80, dynamics: LearnedDynamics | None = None,
+                 settings: DDPSettings | None = None, threads: int | None = None,
+                 cache: str | os.PathLike[str] | None = None) -> None:
+        checks.problem(ocp, "DDP")
+        for name, value in (("intervals", intervals), ("threads", 1 if threads is None else threads)):
+            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+                raise ValueError(f"DDP: {name} is {value!r}; expected an integer >= 1")
+        self.ocp, self.intervals, self.settings = ocp, int(intervals), settings or DDPSettings()
+        self.threads = int(threads or os.cpu_count() or 1)
+        self.dynamics, self.cache = dynamics, cache
+        self.evaluations: Counter[str] = Counter()  # of f in this process, one for each state: "rollout", "backward"
+        net = None if dynamics is None else _fitting(ocp, dynamics)
+        self._weights = np.zeros(1) if net is None else pack_weights(net)
+        self._kernel = ddp_kernel(ocp, dynamics, cache)
+        self._lb, self._ub = np.ascontiguousarray(ocp.system.lbu), np.ascontiguousarray(ocp.system.ubu)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"ocp": self.ocp, "intervals": self.intervals, "dynamics": self.dynamics, "settings": self.settings,
+                "threads": self.threads, "cache": self.cache}
+
+    def __setstate__(self, options: dict[str, Any]) -> None:
+        DDP.__init__(self, **options)  # the kernel is built, or found in the cache, where it is needed
+
+    def solve(self, x0: ArrayLike, t0: ArrayLike = 0.0, *, u: Array | None = None, x: Array | None = None,
+              gain: Array | None = None, curvature: bool = False, workers: int | str = "auto",
+              out: str | os.PathLike[str] | None = None, progress: bool | None = None) -> DDPSolution:
+        """Descend from a guess u [B, K, nu] (default u*), followed with u + gain (x' - x) where x and gain are given.
+
+        Parameters
+        ----------
+        x0 : [nx] or [B, nx]
+        t0 : number or [B], each < horizon
+        curvature : whether to return V_xx
+        workers : "auto" (this process, `threads` of it), a number of threads, or "tcp://...", a Dask scheduler
+        out : a folder that gets each piece of the batch as soon as it is solved: the same call resumes what is there
+        progress : a bar on stderr; default: where that is a terminal
+
+        Raises ValueError before any work for wrong shapes, x0 that is not finite and t0 outside [0, horizon). A problem
+        whose guess blows up, or that finds no minimum, has success False, cost inf and a message; the others go on.
+        Rows do not depend on each other, nor on `workers`.
+        """
+        rows, _ = checks.states(x0, self.ocp.system.nx, self.ocp.system.name)
+        rows = np.ascontiguousarray(rows)
+        times, (pool, here) = self._start_times(t0, len(rows)), self._where(workers)
+        guess = self._guesses(len(rows), u=u, x=x, gain=gain)
+        journal = Journal(None if out is None else Path(out), self._run_key(rows, times, guess, curvature) if out
+                          else "", "DDP")
+        show = sys.stderr.isatty() if progress is None else progress
+        tasks = pieces(self, rows, times, guess, curvature)
+        return assembled(len(rows), stream(Job(here), tasks, pool, journal, show, f"DDP, {self.ocp.system.name}"))
+
+    def descend(self, batch: Batch) -> DDPSolution:
+        """Solve one piece of a batch, here."""
+        work = _Work(self, batch.x0, batch.t0, *(batch.guess.get(name) for name in ("u", "x", "gain")))
+        work.descend()
+        return work.solution(batch.curvature)
+
+    def rollout(self, x0: Array, **guess: Array) -> Array:
+        """The states [B, K+1, nx] from x0 [B, nx] at t0 = 0 under a guess of `solve`'s: where the descent begins."""
+        given = self._guesses(len(x0), **guess)
+        work = _Work(self, np.ascontiguousarray(x0), np.zeros(len(x0)), *(given.get(k) for k in ("u", "x", "gain")))
+        return work.x
+
+    def feedback(self, x: Array, u: Array) -> Array:
+        """Gains [B, K, nu, nx] of one sweep about x [B, K+1, nx], u [B, K, nu]: those of the OCP's cost, damped until
+        it is convex there; 0 where no damping helps."""
+        B, s = len(x), self.settings
+        work = _Work(self, np.ascontiguousarray(x[:, 0]), np.zeros(B), None, None, None)
+        work.x[:], work.u[:] = x, u
+        rows = np.arange(B)
+        while rows.size:
+            work._backward(rows)
+            rows = rows[work.positive[rows] == 0]
+            work.mu[rows] = np.maximum(GROWTH * work.mu[rows], s.damping)
+            work.gain[rows] = 0.0
+            rows = rows[work.mu[rows] <= s.largest_damping]
+        return work.gain
+
+    def _where(self, workers: int | str) -> tuple[Pool, DDP]:
+        """The pool, and the DDP that works in it: on a cluster each worker's threads have pieces of their own."""
+        pool = Pool(workers)
+        if isinstance(workers, str):
+            return (Pool(1), self) if workers == "auto" else (pool, self._with_threads(1))
+        return Pool(1), self._with_threads(int(workers))
+
+    def _with_threads(self, threads: int) -> DDP:
+        other = object.__new__(DDP)
+        other.__dict__.update(vars(self), threads=threads)
+        return other
+
+    def _guesses(self, B: int, **given: Array | None) -> dict[str, Array]:
+        K, nx, nu = self.intervals, self.ocp.system.nx, self.ocp.system.nu
+        shapes = {"u": (B, K, nu), "x": (B, K + 1, nx), "gain": (B, K, nu, nx)}
+        return {name: _shaped(value, shapes[name], name) for name, value in given.items() if value is not None}
+
+    @cached_property
+    def key(self) -> str:
+        """A fingerprint of the problem, the model and the settings."""
+        net = None if self.dynamics is None else self.dynamics.net
+        return fingerprint(json.dumps(self.ocp.to_data(), sort_keys=True), ddp_source(self.ocp, net), self._weights,
+                           self.intervals, self.settings, version("nocl"))
+
+    def _run_key(self, x0: Array, t0: Array, guess: dict[str, Array], curvature: bool) -> str:
+        """A fingerprint of all that the solution depends on."""
+        return fingerprint(self.key, x0, t0, *(part for pair in sorted(guess.items()) for part in pair), curvature)
+
+    def _start_times(self, t0: ArrayLike, B: int) -> Array:
+        given = np.asarray(t0, dtype=np.float64)
+        if given.shape not in ((), (1,), (B,)):
+            raise ValueError(f"t0 has shape {given.shape}; expected a number, or one for each of the {B} states")
+        times = np.broadcast_to(given, (B,)).copy()
+        bad = np.flatnonzero(~((times >= 0) & (times < self.ocp.horizon)))
+        if bad.size:
+            raise ValueError(f"t0[{bad[0]}] is {times[bad[0]]}; expected 0 <= t0 < horizon = {self.ocp.horizon}")
+        return times
+
+
+@dataclass
+class _Work:
+    """The state of a batch while it descends."""
+
+    ddp: DDP
+    x0: Array
+    t0: Array
+    guess_u: Array | None
+    guess_x: Array | None
+    guess_gain: Array | None
+    mu: Array = field(init=False)
+
+    def __post_init__(self) -> None:
+        ocp, B, K = self.ddp.ocp, len(self.x0), self.ddp.intervals
+        nx, nu = ocp.system.nx, ocp.system.nu
+        self.h = (ocp.horizon - self.t0) / K
+        self.x, self.u = np.zeros((B, K + 1, nx)), np.zeros((B, K, nu))
+        self.k, self.gain = np.zeros((B, K, nu)), np.zeros((B, K, nu, nx))
+        self.new_x, self.new_u, self.new_J = np.zeros_like(self.x), np.zeros_like(self.u), np.zeros(B)
+        self.slope, self.curve, self.positive = np.zeros(B), np.zeros(B), np.zeros(B)
+        self.mu, self.alpha, self.iterations = np.zeros(B), np.zeros(B), np.zeros(B, dtype=np.int64)
+        self.state = np.zeros(B, dtype=np.int64)  # an index of MESSAGES
+        self.refused = np.full(B, -1.0)  # the largest mu at which the last sweep's trajectory was not convex
+        u = np.broadcast_to(ocp.u_goal, (B, K, nu)).copy() if self.guess_u is None else self.guess_u
+        x = self.x if self.guess_x is None else self.guess_x
+        gain = self.gain if self.guess_gain is None else self.guess_gain
+        self._rollout(np.arange(B), x, u, gain)
+        self.x[:], self.u[:], self.J = self.new_x, self.new_u, self.new_J.copy()
+        self.state[~np.isfinite(self.J)] = BLEW_UP
+
+    def _rollout(self, rows: Rows, x_bar: Array, u_bar: Array, gain: Array) -> None:
+        d = self.ddp
+        d.evaluations["rollout"] += STAGES * d.intervals * len(rows)
+        d._kernel("nocl_rollout", rows, d.intervals, d._weights, d._lb, d._ub, self.h, self.x0, x_bar, u_bar, self.k,
+                  gain, self.alpha, self.new_x, self.new_u, self.new_J, threads=d.threads)
+
+    def _backward(self, rows: Rows, V: Array | None = None, V_x: Array | None = None,
+                  V_xx: Array | None = None) -> None:
+        d = self.ddp
+        d.evaluations["backward"] += STAGES * d.intervals * len(rows)  # with first and second derivatives
+        d._kernel("nocl_backward", rows, d.intervals, d._weights, d._lb, d._ub, self.h, self.x, self.u, self.mu, self.k,
+                  self.gain, self.slope, self.curve, self.positive, V, V_x, V_xx, threads=d.threads)
+
+    def descend(self) -> None:
+        s = self.ddp.settings
+        while (rows := np.flatnonzero(self.state == RUNNING)).size:
+            self.state[rows[self.iterations[rows] >= s.max_iterations]] = OUT_OF_ITERATIONS
+            rows = rows[self.state[rows] == RUNNING]
+            self.iterations[rows] += 1
+            self._backward(rows)
+            good, bad = rows[self.positive[rows] > 0], rows[self.positive[rows] == 0]
+            self.refused[bad] = np.maximum(self.refused[bad], self.mu[bad])
+            self._damp(bad)
+            small = -(self.slope[good] + self.curve[good]) <= s.tolerance * np.abs(self.J[good]) + 1e-15
+            self._settle(good[small])
+            self._line_search(good[~small])
+
+    def _settle(self, rows: Rows) -> None:
+        """Problems that predict no decrease: done without damping, else tried again with less of it."""
+        done = rows[self.mu[rows] == 0]
+        self.state[done] = CONVERGED
+        self._last_step(done)
+        damped = rows[self.mu[rows] > 0]
+        self._relax(damped)
+        self.state[damped[self.mu[damped] <= self.refused[damped]]] = NOT_CONVEX
+
+    def _last_step(self, rows: Rows) -> None:
+        """One more full Newton step where J does not rise: what is left of u's error is squared."""
+        self.alpha[rows] = 1.0
+        self._rollout(rows, self.x, self.u, self.gain)
+        won = rows[self.new_J[rows] <= self.J[rows] + 4e-15 * np.abs(self.J[rows])]  # rounding decides nothing
+        self._take(won)
+
+    def _take(self, rows: Rows) -> None:
+        self.x[rows], self.u[rows], self.J[rows] = self.new_x[rows], self.new_u[rows], self.new_J[rows]
+        self.refused[rows] = -1.0
+
+    def _line_search(self, rows: Rows) -> None:
+        """Halve each problem's step until J falls by a share of what was predicted; damp those that never do."""
+        self.alpha[rows] = 1.0
+        while rows.size:
+            self._rollout(rows, self.x, self.u, self.gain)
+            a = self.alpha[rows]
+            predicted = a * self.slope[rows] + a * a * self.curve[rows]
+            done = self.new_J[rows] - self.J[rows] <= 1e-3 * np.minimum(predicted, 0.0)  # False for NaN
+            won = rows[done]
+            self._take(won)
+            self._relax(won[self.alpha[won] > 0.2])
+            rows = rows[~done]
+            self.alpha[rows] /= 2
+            stuck = self.alpha[rows] < self.ddp.settings.smallest_step
+            self._damp(rows[stuck])
+            rows = rows[~stuck]
+
+    def _damp(self, rows: Rows) -> None:
+        s = self.ddp.settings
+        self.mu[rows] = np.maximum(GROWTH * self.mu[rows], s.damping)
+        self.state[rows[self.mu[rows] > s.largest_damping]] = NO_DESCENT
+
+    def _relax(self, rows: Rows) -> None:
+        mu = self.mu[rows] / DECAY
+        self.mu[rows] = np.where(mu < self.ddp.settings.damping, 0.0, mu)
+
+    def solution(self, curvature: bool) -> DDPSolution:
+        B, K = len(self.x0), self.ddp.intervals
+        nx = self.x.shape[2]
+        V, V_x = np.zeros((B, K + 1)), np.zeros((B, K + 1, nx))
+        V_xx = np.zeros((B, K + 1, nx, nx)) if curvature else None
+        self.mu[:] = 0
+        self._backward(np.arange(B), V, V_x, V_xx)
+        success = self.state == CONVERGED
+        t = self.t0[:, None] + self.h[:, None] * np.arange(K + 1)
+        return DDPSolution(t, self.x, self.u, self.gain, V, V_x, V_xx, np.where(success, self.J, np.inf), success,
+                           np.array(MESSAGES)[self.state], self.iterations)
+
+
+MESSAGES = ("running", "converged", "stopped at max_iterations", "no descent: the largest damping did not help",
+            "the starting guess blows up: its cost is not finite",
+            "stationary, but no minimum: the cost is not convex in the controls there")
+RUNNING, CONVERGED, OUT_OF_ITERATIONS, NO_DESCENT, BLEW_UP, NOT_CONVEX = range(6)
+
+
+def _fitting(ocp: OCP, dynamics: LearnedDynamics) -> Any:
+    """The networks of f_theta, if its states and controls are the problem's."""
+    if not hasattr(dynamics, "net"):
+        raise ValueError(f"DDP: dynamics is a {type(dynamics).__name__}; expected LearnedDynamics, as "
+                         "nocl.identify gives it, or None for the exact f")
+    ours, theirs = ocp.system.names, dynamics.system.names
+    if ours != theirs:
+        raise ValueError(f"DDP: dynamics was learned for {', '.join(theirs)}; the problem has {', '.join(ours)}")
+    return dynamics.net
+
+
+def _shaped(value: Array, shape: tuple[int, ...], name: str) -> Array:
+    array = np.ascontiguousarray(value, dtype=np.float64)
+    if array.shape != shape:
+        raise ValueError(f"DDP: the guess {name} has shape {array.shape}; expected {shape}, a row for each x0")
+    return array

@@ -1,0 +1,180 @@
+"""What the DDP kernel computes, without a compiler: CasADi's virtual machine for the derivatives, numpy for the sweep.
+
+The arguments are the compiled kernel's (csrc/ddp.h says what they are), and so are the numbers, to rounding.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from functools import lru_cache
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from nocl.ocp import OCP
+from nocl.solvers.ddp.kernel import ddp_source
+from nocl.support.checks import Array
+from nocl.translate.kernels import Kernel, NoCompilerError
+from nocl.translate.rk4 import rk4_cost
+
+Rows = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+
+
+def ddp_kernel(ocp: OCP, dynamics: Any, cache: str | os.PathLike[str] | None) -> Kernel | NumpyKernel:
+    """The compiled kernel, or its twin, with a warning said once, where there is no compiler."""
+    try:
+        return Kernel(ddp_source(ocp, None if dynamics is None else dynamics.net), cache)
+    except NoCompilerError as error:
+        _say_once(f"{error}. DDP goes on in CasADi's virtual machine and numpy, with the same numbers, much slower")
+        return NumpyKernel(ocp, dynamics)
+
+
+@lru_cache
+def _say_once(text: str) -> None:
+    warnings.warn(text, stacklevel=4)
+
+
+class NumpyKernel:
+    """The compiled kernel's twin: called by the same names with the same arrays, which it fills in place."""
+
+    width = 1
+
+    def __init__(self, ocp: OCP, dynamics: Any = None) -> None:
+        x, u, lam = (ca.MX.sym(name, n) for name, n in (("x", ocp.system.nx), ("u", ocp.system.nu),
+                                                        ("lam", ocp.system.nx)))
+        h, z, self.shape = ca.MX.sym("h"), ca.vertcat(x, u), (ocp.system.nx, ocp.system.nu)
+        after, cost = rk4_cost(ocp.system.f if dynamics is None else dynamics.to_casadi(), ocp.L_soft, x, u, h)
+        G = ocp.G(x)
+        H, g = ca.hessian(ca.dot(lam, after) + cost, z)[0], ca.gradient(cost, z)
+        step = ca.Function("step", [x, u, h], [after, cost])
+        slopes = ca.Function("slopes", [x, u, h, lam], [cost, ca.jacobian(after, z), g, H])
+        terminal = ca.Function("terminal", [x], [G, ca.gradient(G, x), ca.hessian(G, x)[0]])
+        if dynamics is None:  # SX runs faster
+            step, slopes = step.expand(), slopes.expand()
+        self._step, self._slopes, self._terminal = step, slopes, terminal
+
+    def __call__(self, name: str, problems: Rows, *args: Any, threads: int = 1) -> None:
+        """Run "nocl_rollout" or "nocl_backward" on the given problem numbers; threads play no part."""
+        if len(problems):
+            with np.errstate(all="ignore"):  # what is not finite stays in its row, and is found there
+                run = self._rollout if name == "nocl_rollout" else self._backward
+                run(problems, *args)
+
+    def _rollout(self, b: Rows, K: int, weights: Array, lb: Array, ub: Array, h: Array, x0: Array, x_bar: Array,
+                 u_bar: Array, k: Array, gain: Array, alpha: Array, x: Array, u: Array, J: Array) -> None:
+        cost = np.zeros(len(b))
+        x[b, 0] = x0[b]
+        for t in range(K):
+            feedback = np.einsum("bij,bj->bi", gain[b, t], x[b, t] - x_bar[b, t])
+            u[b, t] = np.clip(u_bar[b, t] + alpha[b, None] * k[b, t] + feedback, lb, ub)
+            x[b, t + 1], c = _rows(self._step, x[b, t], u[b, t], h[b, None])
+            cost += c[:, 0]
+        J[b] = cost + _rows(self._terminal, x[b, K])[0][:, 0]
+
+    def _backward(self, b: Rows, K: int, weights: Array, lb: Array, ub: Array, h: Array, x: Array, u: Array,
+                  mu: Array, k: Array, gain: Array, slope: Array, curve: Array, positive: Array, V: Array | None,
+                  V_x: Array | None, V_xx: Array | None) -> None:
+        n, m = self.shape
+        value, p, P = _rows(self._terminal, x[b, K])
+        value, P = value[:, 0], P.reshape(-1, n, n)
+        down, bend, good = np.zeros(len(b)), np.zeros(len(b)), np.ones(len(b), dtype=bool)
+        for t in range(K, -1, -1):
+            for out, now in ((V, value), (V_x, p), (V_xx, P)):
+                if out is not None:
+                    out[b, t] = now
+            if t == 0:
+                break
+            cost, F, l, H = _rows(self._slopes, x[b, t - 1], u[b, t - 1], h[b, None], p)  # noqa: E741
+            F, H = (a.reshape(len(b), n + m, -1).transpose(0, 2, 1) for a in (F, H))  # CasADi stores columns
+            Q, q = H + F.transpose(0, 2, 1) @ P @ F, l + np.einsum("bij,bi->bj", F, p)
+            Quu, Qux, qu = Q[:, n:, n:], Q[:, n:, :n], q[:, n:]
+            damped, low, high = Quu + mu[b, None, None] * np.eye(m), lb - u[b, t - 1], ub - u[b, t - 1]
+            step, held, L, ok = boxed_newton(damped, qu, low, high)
+            K_t = substitute(L, np.where(held[:, :, None], 0.0, -Qux))
+            good &= ok
+            down += (step * qu).sum(axis=1)
+            bend += 0.5 * np.einsum("bi,bij,bj->b", step, Quu, step)
+            k[b, t - 1], gain[b, t - 1] = step, K_t
+            value = value + cost[:, 0]
+            K_T = K_t.transpose(0, 2, 1)
+            p = q[:, :n] + np.einsum("bij,bj->bi", K_T, qu + np.einsum("bij,bj->bi", Quu, step)) \
+                + np.einsum("bji,bj->bi", Qux, step)
+            P = Q[:, :n, :n] + K_T @ (Quu @ K_t + Qux) + Qux.transpose(0, 2, 1) @ K_t
+            P = (P + P.transpose(0, 2, 1)) / 2
+        slope[b], curve[b], positive[b] = down, bend, good & np.isfinite(down) & np.isfinite(bend)
+
+
+def _rows(function: ca.Function, *args: Array) -> list[Array]:
+    """A Function on rows [B, n] of each argument; its outputs' nonzeros by columns, as rows [B, ...]."""
+    outs = function.map(len(args[0])).call([ca.DM(a.T) for a in args])
+    return [ca.DM(ca.densify(o)).full().T.reshape(len(args[0]), -1) for o in outs]
+
+
+def factor(Q: Array, held: Mask) -> tuple[Array, Mask]:
+    """L L' = Q on the free controls, the identity on those held; and where Q is positive definite."""
+    m = Q.shape[1]
+    L, positive = np.zeros_like(Q), np.ones(len(Q), dtype=bool)
+    for i in range(m):
+        for j in range(i + 1):
+            rest = np.where(held[:, i] | held[:, j], float(i == j), Q[:, i, j])
+            rest = rest - (L[:, i, :j] * L[:, j, :j]).sum(axis=1)
+            if i == j:
+                ok = held[:, i] | (rest > 1e-12 * Q[:, i, i])
+                positive &= ok
+                L[:, i, i] = np.sqrt(np.where(ok, rest, 1.0))
+            else:
+                L[:, i, j] = rest / L[:, j, j]
+    return L, positive
+
+
+def substitute(L: Array, right: Array) -> Array:
+    """The solution X [B, m, c] of L L' X = right."""
+    X, m = right.copy(), L.shape[1]
+    for i in range(m):
+        X[:, i] = (X[:, i] - np.einsum("br,brc->bc", L[:, i, :i], X[:, :i])) / L[:, i, i, None]
+    for i in reversed(range(m)):
+        X[:, i] = (X[:, i] - np.einsum("br,brc->bc", L[:, i + 1:, i], X[:, i + 1:])) / L[:, i, i, None]
+    return X
+
+
+def boxed_newton(Q: Array, q: Array, low: Array, high: Array) -> tuple[Array, Mask, Array, Mask]:
+    """min q'k + k'Q k / 2 with low <= k <= high by the active sets of csrc/ddp.h: (k, held, factor, positive)."""
+    k, busy, positive = np.zeros_like(q), np.ones(len(q), dtype=bool), np.ones(len(q), dtype=bool)
+    held = ((low >= 0) & (q > 0)) | ((high <= 0) & (q < 0))
+    for last in [*[False] * (3 * q.shape[1]), True]:
+        p = np.where(held, 0.0, -q - np.einsum("bij,bj->bi", Q, k))
+        L, ok = factor(Q, held)
+        positive &= ok | ~busy
+        p = substitute(L, p[:, :, None])[:, :, 0]
+        k, blocked = _step_to_bound(p, low, high, busy, k)
+        if last:
+            break
+        held = held | blocked
+        stopped = blocked.any(axis=1)
+        let_go = _release(Q, q, k, low, held, busy & ~stopped)
+        held &= ~let_go
+        busy &= stopped | let_go.any(axis=1)
+        if not busy.any():
+            break
+    return k, held, L, positive
+
+
+def _step_to_bound(p: Array, low: Array, high: Array, busy: Mask, k: Array) -> tuple[Array, Mask]:
+    """k + p as far as the first bound, in busy rows, and the controls that it blocked."""
+    bound = np.where(p > 0, high, low)
+    reach = np.where(p != 0, (bound - k) / p, np.inf)
+    shortest = np.clip(reach.min(axis=1, keepdims=True), 0.0, 1.0)
+    blocked = busy[:, None] & (reach <= shortest) & (reach < 1)
+    return np.where(busy[:, None], np.where(blocked, bound, k + shortest * p), k), blocked
+
+
+def _release(Q: Array, q: Array, k: Array, low: Array, held: Mask, may: Mask) -> Mask:
+    """The held control, in the rows that may, whose multiplier has the wrong sign by most."""
+    g = q + np.einsum("bij,bj->bi", Q, k)
+    wrong = np.where(held & may[:, None], np.where(k <= low, -g, g), 0.0)
+    released: Mask = (wrong > 0) & (wrong == wrong.max(axis=1, keepdims=True))
+    return released

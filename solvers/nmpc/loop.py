@@ -1,0 +1,119 @@
+"""NMPC as feedback: solved again at each call from the last plan, shifted; failures flagged."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from nocl.data import Solution, Trajectory
+from nocl.support import checks
+from nocl.support.checks import Array
+
+if TYPE_CHECKING:
+    from nocl.solvers.nmpc.solver import NMPC
+
+LAST = 0.95  # largest share of what is left of the horizon that a closed loop's first interval may take
+NEAR_END = 1e-6  # of the horizon: a call this late is taken as one just before the end
+
+
+class Loop:
+    """u(x, t) by solving again from the measured x, warm-started from the last plan.
+
+    Shrinking (default): the plan reaches from t to the OCP's horizon T, or to t + `horizon` where NMPC has a shorter
+    one, at most to T. Receding: it is as long at each t as at t = 0, and charges G, or the terminal cost, at its own
+    end. The first interval of a plan is as long as the control will be held, `hold` times in T; the rest of it is cut
+    into N - 1 equal ones. A call at an earlier time than the last, at the same time from other states, or with another
+    number of states starts afresh from all starts.
+
+    `stats` has an entry a call: t; and [B] success, seconds, iterations, cost, message, and source of the control:
+    "solved", or where the solve failed (after one more try, from all starts) "last plan", held on, or "u*" where there
+    is none yet. A failure is never silent: success is False there, and `failures` counts them.
+    """
+
+    def __init__(self, nmpc: NMPC, hold: int | None = None, receding: bool = False) -> None:
+        if hold is not None and (isinstance(hold, bool) or not isinstance(hold, (int, np.integer)) or hold < 1):
+            raise ValueError(f"hold is {hold!r}; expected how many controls the horizon has, an integer >= 1")
+        self.nmpc, self.hold, self.receding = nmpc, hold or nmpc.intervals, receding
+        self.plan: Solution | None = None
+        self.begin = 0.0  # the time of the plan's first node
+        self.asked: Array | None = None  # the states of the last call
+        self.stats: list[dict[str, Any]] = []
+
+    @property
+    def failures(self) -> int:
+        """Solves that failed, over all calls and states."""
+        return sum(int((~step["success"]).sum()) for step in self.stats)
+
+    def __call__(self, x: ArrayLike, t: float = 0.0) -> Array:
+        """u [nu] or [B, nu] at time t."""
+        s = self.nmpc.ocp.system
+        rows, single = checks.states(x, s.nx, s.name, "x")
+        nodes = self.nodes(float(t))
+        if self._afresh(rows, float(t)):
+            self.stats, self.plan = [], None
+        guess = self._guess(rows, nodes, float(t))
+        self.plan = self._solve(rows, guess, nodes, float(t))
+        self.begin, self.asked = float(t), rows.copy()
+        return self.plan.u[0, 0] if single else self.plan.u[:, 0]
+
+    def _afresh(self, x: Array, t: float) -> bool:
+        if self.plan is None or self.asked is None or self.asked.shape != x.shape or t < self.begin:
+            return True
+        return t == self.begin and not np.array_equal(x, self.asked)
+
+    def nodes(self, t: float) -> Array:
+        """t, t + the time that a control is held, ..., the end of the plan [N+1]; from 0 where receding."""
+        T, N = self.nmpc.ocp.horizon, self.nmpc.intervals
+        t = 0.0 if self.receding else min(t, T * (1 - NEAR_END))  # some ask at the end, too
+        end = min(t + self.nmpc.window, T)
+        first = min(T / self.hold, LAST * (end - t))
+        return np.r_[t, np.linspace(t + first, end, N)]
+
+    def _guess(self, x: Array, nodes: Array, t: float) -> tuple[Array, Array]:
+        """The last plan, shifted; else x held under u*."""
+        if self.plan is None:
+            return (np.repeat(x[:, None], len(nodes), axis=1),
+                    np.tile(self.nmpc.ocp.u_goal, (len(x), len(nodes) - 1, 1)))
+        return shifted(self.plan, x, nodes + (t - self.begin if self.receding else 0.0))
+
+    def _solve(self, x: Array, guess: tuple[Array, Array], nodes: Array, t: float) -> Solution:
+        """The new plan: a row whose solve fails twice holds the guess instead."""
+        warm = self.plan is not None
+        plan = Trajectory(nodes, *guess) if warm else None
+        solution = self.nmpc.solve(x, plan, nodes=nodes, workers=1, progress=False)
+        failed = np.flatnonzero(~np.asarray(solution.success))
+        if warm and failed.size:
+            again = self.nmpc.solve(x[failed], nodes=nodes, workers=1, progress=False)
+            solution = _put(solution, again, failed)
+        success = np.asarray(solution.success)
+        source = np.where(success, "solved", "last plan" if warm else "u*")
+        self.stats.append({"t": t, "success": success, "seconds": solution.seconds, "cost": solution.cost,
+                           "iterations": solution.iterations, "message": solution.message, "source": source})
+        ok = success[:, None, None]
+        held = Trajectory(solution.t, np.where(ok, solution.x, guess[0]), np.where(ok, solution.u, guess[1]))
+        return replace(solution, trajectory=held)
+
+
+def shifted(last: Solution, x: Array, nodes: Array) -> tuple[Array, Array]:
+    """The last plan on new nodes, held on past its end, its states moved to the measured x at the start."""
+    N = last.u.shape[1]
+    held = np.clip(np.searchsorted(last.t, (nodes[:-1] + nodes[1:]) / 2, side="right") - 1, 0, N - 1)
+    states = np.stack([np.stack([np.interp(nodes, last.t, column) for column in path.T], axis=1) for path in last.x])
+    return states + np.linspace(1, 0, len(nodes))[None, :, None] * (x - states[:, 0])[:, None], last.u[:, held]
+
+
+def _put(solution: Solution, again: Solution, rows: NDArray[np.int64]) -> Solution:
+    """`solution` with its rows replaced; seconds and iterations add up."""
+    fields: dict[str, Any] = {}
+    for name in ("cost", "costate", "success", "seconds", "iterations"):
+        fields[name] = np.array(getattr(solution, name))
+        fields[name][rows] = getattr(again, name) + (fields[name][rows] if name in ("seconds", "iterations") else 0)
+    message = list(solution.message)
+    for i, said in zip(rows, again.message, strict=True):
+        message[int(i)] = said
+    x, u = solution.x.copy(), solution.u.copy()
+    x[rows], u[rows] = again.x, again.u
+    return replace(solution, trajectory=Trajectory(solution.t, x, u), message=message, dense=None, **fields)

@@ -1,0 +1,188 @@
+"""What is tried from one initial state, as plain tasks that any process can do, and what came of it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from nocl.solvers.nmpc.guesses import Guess
+from nocl.solvers.nmpc.transcription import FEASIBLE, Answer, Transcription
+from nocl.support.checks import Array
+
+SAME = 1e-3  # costs closer than this, relative, count as the same optimum
+TINY = 1e-10  # ... and absolute: costs below it are equal
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """Solves from one state: the guesses given, then `starts` built-in ones."""
+
+    name: str  # unique in a run
+    row: int
+    x0: Array  # [nx]
+    t: Array  # [N+1]
+    guesses: Sequence[Guess] = ()
+    warm: int = 0  # how many of these, the first ones, are solutions of problems nearby
+    starts: int = 0
+    seed: int = 0
+    size: int = 1  # states
+
+    def outcome(self, arrays: dict[str, Any]) -> Outcome:
+        """What came of this task, from its `arrays()`."""
+        return Outcome(self.name, self.row, arrays["costs"], float(arrays["seconds"]), int(arrays["iterations"]),
+                       _answer(arrays, "best"), _answer(arrays, "failed"))
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What a task found."""
+
+    name: str
+    row: int
+    costs: Array  # [n] of each solve, inf where it failed
+    seconds: float
+    iterations: int
+    best: Answer | None
+    failed: Answer | None  # the most feasible of the solves that failed
+    size: int = 1
+
+    def arrays(self) -> dict[str, Any]:
+        """Its fields as plain arrays, for a file."""
+        found: dict[str, Any] = {"costs": self.costs, "seconds": self.seconds, "iterations": self.iterations}
+        for kind in ("best", "failed"):
+            answer = getattr(self, kind)
+            found |= {} if answer is None else {f"{kind}.{name}": value for name, value in vars(answer).items()}
+        return found
+
+
+def _answer(arrays: dict[str, Any], kind: str) -> Answer | None:
+    fields: dict[str, Any] = {name.removeprefix(f"{kind}."): value if value.ndim else value.item()
+                              for name, value in arrays.items() if name.startswith(f"{kind}.")}
+    return Answer(**fields) if fields else None
+
+
+def attempt(program: Transcription, task: Task, guesses: Sequence[Guess]) -> Outcome:
+    """Solve from each guess."""
+    begin, answers = time.perf_counter(), list[Answer]()
+    for i, (x, u) in enumerate(guesses):
+        warm = program.warm.solve(task.x0, task.t, x, u) if i < task.warm else None
+        answers.append(warm if warm is not None and warm.success else program.solve(task.x0, task.t, x, u))
+    answers += _second_opinion(program, task, answers)
+    seconds = time.perf_counter() - begin
+    good, bad = ([a for a in answers if bool(a.success) is ok] for ok in (True, False))
+    return Outcome(task.name, task.row, np.array([a.cost for a in answers]), seconds,
+                   sum(a.iterations for a in answers), min(good, key=lambda a: a.cost, default=None),
+                   min(bad, key=lambda a: a.violation, default=None))
+
+
+def _second_opinion(program: Transcription, task: Task, answers: Sequence[Answer]) -> list[Answer]:
+    """Where fatrop got stuck from all starts: IPOPT from its most feasible point, to solve it or to say why not."""
+    if program.backend != "fatrop" or any(a.success for a in answers):
+        return []
+    stuck = [a for a in answers if not a.message.startswith("stopped") and np.isfinite(a.x).all() and
+             np.isfinite(a.u).all()]
+    if not stuck:
+        return []
+    best = min(stuck, key=lambda a: a.violation)
+    answer = program.second.solve(task.x0, task.t, best.x, best.u)
+    return [replace(answer, message=f"{answer.message}, by IPOPT after fatrop: {best.message}")]
+
+
+def distinct(costs: ArrayLike) -> Array:
+    """(cost, how many reached it) of each local optimum among costs, inf where there is none, rising [n, 2]."""
+    found = np.sort(np.asarray(costs, dtype=np.float64))
+    found = found[np.isfinite(found)]
+    if not found.size:
+        return np.zeros((0, 2))
+    first = np.r_[True, np.diff(found) > np.maximum(SAME * np.abs(found[1:]), TINY)]
+    return np.c_[found[first], np.diff(np.r_[np.flatnonzero(first), len(found)])]
+
+
+@dataclass(eq=False)
+class Search:
+    """All that was tried from one state, in the order of the tasks."""
+
+    program: Transcription
+    x0: Array
+    best: Answer | None = None
+    failed: Answer | None = None
+    costs: list[float] = field(default_factory=list)
+    seconds: float = 0.0
+    iterations: int = 0
+    refusal: str = ""
+
+    def __post_init__(self) -> None:
+        self.refusal = _violated_start(self.program, self.x0)
+
+    @property
+    def cost(self) -> float:
+        return np.inf if self.best is None else self.best.cost
+
+    def add(self, outcome: Outcome) -> None:
+        self.costs += outcome.costs.tolist()
+        self.seconds += outcome.seconds
+        self.iterations += outcome.iterations
+        if outcome.best is not None and outcome.best.cost < self.cost:
+            self.best = outcome.best
+        if outcome.failed is not None and (self.failed is None or outcome.failed.violation < self.failed.violation):
+            self.failed = outcome.failed
+
+    @property
+    def hits(self) -> int:
+        if self.best is None:
+            return 0
+        near = np.array(self.costs) - self.cost <= max(SAME * abs(self.cost), TINY)
+        return int(near.sum())
+
+    @property
+    def optima(self) -> Array:
+        """(cost, starts that found it) of each local optimum found, rising [n, 2]."""
+        return distinct(self.costs)
+
+    @property
+    def message(self) -> str:
+        if self.refusal:
+            return self.refusal
+        if self.best is not None:
+            return self.best.message + _outside(self.program, self.x0)
+        reason = "nothing was tried" if self.failed is None else self.failed.message
+        return (f"no start of {len(self.costs)} converged from x0 = {_text(self.x0)}{_outside(self.program, self.x0)}: "
+                f"{reason}; try {_remedy(reason, self.program)}")
+
+
+def _remedy(reason: str, program: Transcription) -> str:
+    if reason.startswith("stopped"):
+        return f"more iterations (options={{'{program.backend}.max_iter': 3000}}), more starts or another guess"
+    soft = ", or constraints='soft'" if program.n_path else ""
+    if reason.startswith("NaN"):
+        return "a guess that stays where f, L and h are finite, or bounds lbu, ubu that keep the states there" + soft
+    return "more starts, another guess, or more intervals" + soft
+
+
+def _violated_start(program: Transcription, x0: Array) -> str:
+    """Why x0 is no start at all: inside an obstacle that no control can undo."""
+    if not program.n_path:
+        return ""
+    h = program.ocp.h(x0).full().ravel()
+    i = int(np.argmin(h))
+    if h[i] >= -FEASIBLE:
+        return ""
+    return (f"infeasible: path constraint {list(program.ocp.path_constraints)[i]!r} is violated by {-h[i]:.3g} at node "
+            f"0, by x0 = {_text(x0)} itself: move x0, or use constraints='soft'")
+
+
+def _outside(program: Transcription, x0: Array) -> str:
+    """A note where x0 is outside X: the exact equations hold there too, a model learned in X may not."""
+    s = program.ocp.system
+    out = [f"{name} = {v:.4g} outside [{low:g}, {high:g}]" for name, v, low, high in
+           zip(s.state_names, x0, s.lbx, s.ubx, strict=True) if not low <= v <= high]
+    return f" (x0 is outside X: {', '.join(out)})" if out else ""
+
+
+def _text(x: Array) -> str:
+    return np.array2string(x, precision=4, separator=", ")

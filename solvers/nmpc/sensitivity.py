@@ -1,0 +1,168 @@
+"""Sensitivities of a multiple-shooting solution: costates at both sides of a node, feedback gains, Hessians of J*.
+
+With Q_k(x, u) = the cost of interval k + lambda_{k+1}' F(x, u), the second variation of the discretised problem about
+a solution is a linear-quadratic problem with A_k, B_k = dF, W_k = the exact Hessian of Q_k, controls at their bounds
+held, and active path constraints as equations on dx. Its Riccati recursion gives du_k = -K_k dx_k (the neighbouring
+extremal: Bryson, Ho (1975), "Applied Optimal Control", ch. 6) and d2J*/dx_k2; equations on the state are carried
+backwards as in Laine, Tomlin (2019), "Efficient computation of feedback control for equality-constrained LQR".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import casadi as ca
+import numpy as np
+from numpy.typing import NDArray
+
+from nocl.solvers.nmpc.transcription import Transcription
+from nocl.support.checks import Array
+
+RANK = 1e-9  # singular values below this share of the largest count as zero
+ROUNDING = 1e-12  # curvature below this share of the largest is no curvature
+
+
+@dataclass(frozen=True, eq=False)
+class Derivatives:
+    """The derivatives of one program that sensitivities need, built when first used."""
+
+    program: Transcription
+
+    @cached_property
+    def flow(self) -> ca.Function:
+        """(x, u, costate) -> d/dt of (x, costate), the control held: f and -dH/dx."""
+        p, s = self.program, self.program.ocp.system
+        x, u, costate = p.sym("x", s.nx), p.sym("u", s.nu), p.sym("costate", s.nx)
+        xdot = p.f(x, u)
+        return ca.Function("flow", [x, u, costate], [
+            ca.vertcat(xdot, -ca.gradient(p.L(x, u) + ca.dot(costate, xdot), x))])
+
+    @cached_property
+    def first(self) -> ca.Function:
+        """(x, u, h, costate at the end) -> gradient of Q in (x, u), side by side."""
+        return self._stage(second=False)
+
+    @cached_property
+    def second(self) -> ca.Function:
+        """(x, u, h, costate at the end) -> (gradient of Q, Jacobian of F, Hessian of Q) in (x, u)."""
+        return self._stage(second=True)
+
+    def _stage(self, second: bool) -> ca.Function:
+        p, s = self.program, self.program.ocp.system
+        x, u, h, costate = p.sym("x", s.nx), p.sym("u", s.nu), p.sym("h"), p.sym("costate", s.nx)
+        z = p.sym("z", s.nx + s.nu)
+        end, cost = p.step(z[: s.nx], z[s.nx:], h)
+        hessian, gradient = ca.hessian(cost + ca.dot(costate, end), z)
+        out = [gradient, ca.jacobian(end, z), hessian] if second else [gradient]
+        inner = ca.Function("Q", [z, h, costate], [ca.densify(e) for e in out])
+        return ca.Function("stage", [x, u, h, costate], inner.call([ca.vertcat(x, u), h, costate]))
+
+    @cached_property
+    def end(self) -> ca.Function:
+        """(x, t) -> (gradient, Hessian) of the cost at the last node."""
+        n = self.program.ocp.system.nx
+        x, t = ca.MX.sym("x", n), ca.MX.sym("t")
+        hessian, gradient = ca.hessian(self.program.end_cost(x, t), x)
+        return ca.Function("end", [x, t], [ca.densify(gradient), ca.densify(hessian)])
+
+    @cached_property
+    def path(self) -> ca.Function:
+        """(x, mu) -> (h, dh/dx, Hessian of mu' h)."""
+        ocp = self.program.ocp
+        x, mu = ca.SX.sym("x", ocp.system.nx), ca.SX.sym("mu", self.program.n_path)
+        h = ocp.h(x)
+        return ca.Function("path", [x, mu], [h, ca.densify(ca.jacobian(h, x)),
+                                             ca.densify(ca.hessian(ca.dot(mu, h), x)[0])])
+
+
+@lru_cache(maxsize=32)
+def derivatives(program: Transcription) -> Derivatives:
+    """Those of a program, built once."""
+    return Derivatives(program)
+
+
+def dense(program: Transcription, t: Array, x: Array, u: Array, costate: Array) -> Array:
+    """(x, costate) at both ends of each interval and their time derivatives [N, 4, 2 nx]: start, end, slopes."""
+    d, h = derivatives(program), np.diff(t)[None]
+    after = d.first(x[:-1].T, u.T, h, costate[1:].T).full()[: x.shape[1]].T  # an active path constraint is a jump
+    start, end = np.c_[x[:-1], after], np.c_[x[1:], costate[1:]]
+    slopes = (d.flow(e[:, : x.shape[1]].T, u.T, e[:, x.shape[1]:].T).full().T for e in (start, end))
+    return np.stack([start, end, *slopes], axis=1)
+
+
+def second_variation(program: Transcription, t: Array, x: Array, u: Array, costate: Array) -> tuple[Array, Array]:
+    """(gains [N, nu, nx], Hessians of J* [N+1, nx, nx]); NaN from where the solution is no strict local optimum."""
+    d, n = derivatives(program), x.shape[1]
+    N, m = u.shape
+    gradient, F_z, W = (np.moveaxis(v.full().reshape(v.shape[0], N, -1), 1, 0) for v in d.second(
+        x[:-1].T, u.T, np.diff(t)[None], costate[1:].T))
+    end_gradient, P = (v.full() for v in d.end(x[-1], t[-1]))
+    after = np.vstack([gradient[:, :n, 0], end_gradient.T])  # gradient at a node without its own path constraints
+    free = _free(program, u, gradient[:, n:, 0])
+    gains, hessians = np.full((N, m, n), np.nan), np.full((N + 1, n, n), np.nan)
+    hessians[N], H = P, np.zeros((0, n))
+    for k in range(N - 1, -1, -1):
+        P, H = _with_path(program, x[k + 1], after[k + 1] - costate[k + 1], P, H)
+        step = _riccati(F_z[k], W[k], P, H, free[k])
+        if step is None:
+            break
+        gains[k], P, H = step
+        hessians[k] = P
+    return gains, hessians
+
+
+def _free(program: Transcription, u: Array, gradient: Array) -> NDArray[np.bool_]:
+    """Controls [N, nu] not held at a bound, where multiplier times width exceeds the distance to it in widths."""
+    s = program.ocp.system
+    width = np.asarray(s.ubu) - s.lbu
+    lower, upper = (u - s.lbu) / width, (s.ubu - u) / width
+    return ~((gradient * width > lower) & (lower < 0.5) | (-gradient * width > upper) & (upper < 0.5))
+
+
+def _with_path(program: Transcription, x: Array, jump: Array, P: Array, H: Array) -> tuple[Array, Array]:
+    """P and the equations H dx = 0 with a node's own path constraints; the costate jumps by mu' dh/dx across it."""
+    if not program.n_path:
+        return P, H
+    d = derivatives(program)
+    h, h_x = (v.full() for v in d.path(x, 0)[:2])
+    mu = np.linalg.lstsq(h_x.T, jump, rcond=None)[0]
+    active = mu > np.maximum(h[:, 0], 0.0) + np.sqrt(ROUNDING)
+    mu = np.where(active, mu, 0.0)
+    return P - d.path(x, mu)[2].full(), np.vstack([H, h_x[active]])
+
+
+def _riccati(F_z: Array, W: Array, P: Array, H: Array, free: NDArray[np.bool_]) -> tuple[Array, Array, Array] | None:
+    """(K, P, H) one interval earlier, or None where the free controls have a direction without curvature."""
+    n = len(P)
+    A, B = F_z[:, :n], F_z[:, n:][:, free]
+    P_xx, P_ux = W[:n, :n] + A.T @ P @ A, W[n:, :n][free] + B.T @ P @ A
+    P_uu = W[n:, n:][np.ix_(free, free)] + B.T @ P @ B
+    K, Z, H = _on_equations(H @ A, H @ B)
+    curvature = Z.T @ P_uu @ Z
+    if Z.shape[1]:
+        if np.linalg.eigvalsh(curvature)[0] <= ROUNDING * max(1.0, np.abs(P_uu).max()):
+            return None
+        K = K + Z @ np.linalg.solve(curvature, Z.T @ (P_ux - P_uu @ K))
+    P = P_xx - P_ux.T @ K - K.T @ P_ux + K.T @ P_uu @ K
+    full = np.zeros((len(free), n))
+    full[free] = K
+    return full, (P + P.T) / 2, H
+
+
+def _on_equations(M: Array, B: Array) -> tuple[Array, Array, Array]:
+    """M dx + B du = 0 as du = -K dx + Z w, and the equations [r, nx] left for dx alone."""
+    if not B.size:
+        return np.zeros((B.shape[1], M.shape[1])), np.eye(B.shape[1]), _independent(M)
+    U, s, Vt = np.linalg.svd(B)
+    r = int((s > RANK * max(1.0, s[0])).sum())
+    K = Vt[:r].T @ (U[:, :r].T @ M / s[:r, None])
+    return K, Vt[r:].T, _independent(U[:, r:].T @ M)
+
+
+def _independent(M: Array) -> Array:
+    """Rows that span what M's do."""
+    if not M.size:
+        return M
+    _, s, Vt = np.linalg.svd(M, full_matrices=False)
+    return np.asarray(Vt[s > RANK * max(1.0, s[0])])

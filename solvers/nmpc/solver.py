@@ -1,0 +1,384 @@
+"""NMPC: the reference. Multiple shooting from several starts for each initial state, the best kept, failures told."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property, lru_cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+from numpy.typing import ArrayLike
+
+from nocl.data import Solution, Trajectory
+from nocl.judge import dynamics_function
+from nocl.ocp import OCP
+from nocl.solvers.lqr import LQR
+from nocl.solvers.nmpc import guesses as starting
+from nocl.solvers.nmpc.guesses import Guess
+from nocl.solvers.nmpc.loop import Loop
+from nocl.solvers.nmpc.search import TINY, Outcome, Search, Task, attempt
+from nocl.solvers.nmpc.sensitivity import dense, second_variation
+from nocl.solvers.nmpc.transcription import BACKENDS, Transcription
+from nocl.support import checks
+from nocl.support.checks import Array
+from nocl.support.compiler import fingerprint, folder_of, target
+from nocl.support.pool import Journal, Pool, do
+
+BETTER = 1e-6  # relative improvement that makes a neighbour's solution worth passing on
+FRESH = 2  # more random starts in a round, for a state of whose solves a share below SURE ended at its best
+SURE = 0.3
+KEPT = 32  # programs kept in memory
+
+
+@dataclass(frozen=True, eq=False)
+class NMPC:
+    """min over u_0 ... u_{N-1}, held, of the OCP's cost under RK4 steps, for each initial state.
+
+    Parameters
+    ----------
+    ocp : OCP
+    intervals : N
+    dynamics : casadi.Function (x, u) -> xdot, or an object with `to_casadi()`; default: the exact f
+    solver : "fatrop" (fast) or "ipopt" (reference); another nlpsol of CasADi's by its name
+    substeps : RK4 steps in each interval
+    horizon : length of the window that is optimised, at most the OCP's horizon T (default); it ends at T at the latest
+    terminal : cost at the window's end in place of G: a casadi.Function (x) or (x, t) -> number, or an object with
+        `value_to_casadi()`, such as a trained value function
+    starts : guesses tried for each state, beyond those that `solve` is given
+    passes : rounds in which states of one batch are solved again from their neighbours' solutions, where the problem
+        has a mirror image from the mirrored ones, and from any other state's, until a round improves nothing
+    neighbours : how many in each round
+    constraints : "hard": path constraints at the nodes; "soft": the penalty of ocp.L_soft in the cost instead
+    seed : of the random starts
+    options : of the nlpsol, like {"ipopt.tol": 1e-6}
+    compiled : compile the program by gcc, once: into the folder that is named here, or for True into that of the
+        environment's NOCL_CACHE (without it: for as long as the process lives); later constructions load it from there
+
+    A second NMPC of an equal problem with equal settings uses the program that the first one built.
+    """
+
+    ocp: OCP
+    intervals: int = 80
+    dynamics: Any = field(default=None, kw_only=True)
+    solver: str = field(default="fatrop", kw_only=True)
+    substeps: int = field(default=1, kw_only=True)
+    horizon: float | None = field(default=None, kw_only=True)
+    terminal: Any = field(default=None, kw_only=True)
+    starts: int = field(default=8, kw_only=True)
+    passes: int = field(default=4, kw_only=True)
+    neighbours: int = field(default=3, kw_only=True)
+    constraints: str = field(default="hard", kw_only=True)
+    seed: int = field(default=0, kw_only=True)
+    options: Mapping[str, Any] | None = field(default=None, kw_only=True)
+    compiled: bool | str | os.PathLike[str] = field(default=False, kw_only=True)
+
+    def __post_init__(self) -> None:
+        checks.problem(self.ocp, "NMPC")
+        for name, least in (("intervals", 2), ("substeps", 1), ("starts", 1), ("passes", 0), ("neighbours", 1)):
+            value = getattr(self, name)
+            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
+                raise ValueError(f"NMPC: {name} is {value!r}; expected an integer >= {least}")
+        if self.constraints not in ("hard", "soft"):
+            raise ValueError(f"NMPC: constraints is {self.constraints!r}; expected 'hard' or 'soft'")
+        if self.solver not in BACKENDS and not ca.has_nlpsol(self.solver):
+            raise ValueError(f"NMPC: solver is {self.solver!r}; expected {' or '.join(BACKENDS)}, or an nlpsol "
+                             "that this CasADi has")
+        if self.compiled == "" or not isinstance(self.compiled, (bool, str, os.PathLike)):
+            raise ValueError(f"NMPC: compiled is {self.compiled!r}; expected True, False, or a folder")
+        if checks.number(self.window, "horizon", "NMPC", positive=True) > self.ocp.horizon:
+            raise ValueError(f"NMPC: horizon is {self.horizon!r}; expected at most {self.ocp.horizon:g}, the OCP's")
+        if self.dynamics is not None:
+            object.__setattr__(self, "dynamics", dynamics_function(self.ocp, self.dynamics))
+        object.__setattr__(self, "terminal", _terminal(self.ocp, self.terminal))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {f.name: getattr(self, f.name) for f in fields(self)}  # without what is cached: it is built again
+
+    @property
+    def window(self) -> float:
+        """The length of the window that is optimised."""
+        return self.ocp.horizon if self.horizon is None else self.horizon
+
+    @cached_property
+    def key(self) -> str:
+        """A fingerprint of the program: of the problem, models and settings that it is built from."""
+        options = sorted((self.options or {}).items())
+        return fingerprint(json.dumps(self.ocp.to_data(), sort_keys=True), self.dynamics, self.terminal,
+                           int(self.intervals), int(self.substeps), self.constraints, self.solver, options)
+
+    @cached_property
+    def program(self) -> Transcription:
+        """The nonlinear program, built once for each problem and settings."""
+        where = "" if self.compiled is False else folder_of(self.compiled)
+        return _program(_Recipe(self.key + where, self))
+
+    @cached_property
+    def mirrors(self) -> list[tuple[Array, Array]]:
+        """Mirror images of the problem, as signs of x - x* and u - u*."""
+        return starting.mirrors(self.ocp, self.dynamics)
+
+    def solve(self, x0: ArrayLike, guesses: Any = None, *, t0: float = 0.0, nodes: ArrayLike | None = None,
+              starts: int | None = None, gains: bool = False, workers: int | str = "auto",
+              out: str | os.PathLike[str] | None = None, progress: bool | None = None) -> Solution:
+        """The best solution found from each state x0 [nx] or [B, nx] at time t0.
+
+        Parameters
+        ----------
+        guesses : tried first: a Solution or Trajectory nearby (solved with a small barrier: a warm start), controls u
+            [B, N, nu], (x [B, N+1, nx], u), a controller (x, t) -> u whose rollout is meant, or a list of them
+        nodes : times of the nodes [N+1]; default: N equal intervals from t0 to the window's end
+        starts : built-in starts for each state; default: self.starts, or none where guesses are given
+        gains : also the Solution's `gains` and `hessian`
+        workers : 1, a number of processes, "auto": processes where the measured cost of the first states says that
+            they pay; or "tcp://...", a Dask scheduler
+        out : a folder that gets each state's outcome as soon as it is there: the same call resumes what is there
+        progress : a bar on stderr; default: where that is a terminal
+
+        Returns a Solution with a row for each state, the same for any `workers`. Its `seconds`, `iterations`, `starts`
+        and `optima` cover all that was tried. A state without a solution has success False, cost inf, and the message
+        of its most feasible start. A state outside X is solved, and its message notes it: X is where samples are drawn
+        from, which binds no exact f, but a learned model was not fitted there.
+        Raises ValueError before any solve where shapes do not fit or numbers are not finite.
+        """
+        s = self.ocp.system
+        rows, _ = checks.states(x0, s.nx, s.name)
+        if not len(rows):
+            raise ValueError(f"x0 has shape {np.shape(x0)}; expected at least one state")
+        t = self._nodes(t0, nodes)
+        tried = [one for one in (guesses if isinstance(guesses, list) else [guesses]) if one is not None]
+        tried.sort(key=lambda one: not _is_solution(one))
+        given, warm = [_given(one, self, rows, t) for one in tried], sum(map(_is_solution, tried))
+        n = starts if starts is not None else (0 if given else self.starts)
+        if n < 1 and not given:
+            raise ValueError(f"starts is {n}; expected at least 1, or guesses")
+        show = sys.stderr.isatty() if progress is None else progress
+        journal = Journal(None if out is None else Path(out), self._run_key(rows, t, given, n, warm) if out else "")
+        run = _Run(self, rows, t, Pool(workers), journal, show)
+        run.first([[guess[i] for guess in given] for i in range(len(rows))], n, warm)
+        if n:
+            run.exchange()
+        solution = _collect(run.searches, t)
+        return self.with_gains(solution) if gains else solution
+
+    def with_gains(self, solution: Solution) -> Solution:
+        """A Solution of this NMPC with its feedback gains du_k = -gains_k dx_k and the Hessians of J* at the nodes.
+
+        By a Riccati recursion with the exact second derivatives of the discretised problem; controls at a bound keep
+        it (zero gains) and active path constraints stay active.
+        """
+        B, (N, nx, nu) = len(solution.x), (self.intervals, self.ocp.system.nx, self.ocp.system.nu)
+        if solution.u.shape != (B, N, nu):
+            raise ValueError(f"the solution's u has shape {solution.u.shape}; expected [B, {N}, {nu}], of this NMPC")
+        gains, hessian = np.full((B, N, nu, nx), np.nan), np.full((B, N + 1, nx, nx), np.nan)
+        for i in np.flatnonzero(solution.success):
+            gains[i], hessian[i] = second_variation(self.program, solution.t, solution.x[i], solution.u[i],
+                                                    solution.costate[i])
+        return replace(solution, gains=gains, hessian=hessian)
+
+    def controller(self, hold: int | None = None, receding: bool = False) -> Loop:
+        """Closed loop u(x, t), solved again at each call from the shifted last plan.
+
+        hold: how many controls T has (default N); receding: a window that moves on, instead of one that ends at T.
+        """
+        return Loop(self, hold, receding)
+
+    def _nodes(self, t0: float, nodes: ArrayLike | None) -> Array:
+        T, N = self.ocp.horizon, self.intervals
+        if not 0 <= t0 < T:
+            raise ValueError(f"t0 is {t0!r}; expected 0 <= t0 < {T:g}, the horizon")
+        t = np.linspace(t0, min(t0 + self.window, T), N + 1) if nodes is None else np.asarray(nodes, dtype=np.float64)
+        if t.shape != (N + 1,) or not (np.diff(t) > 0).all() or t[0] < 0 or t[-1] > T * (1 + 1e-9):
+            raise ValueError(f"nodes have shape {t.shape}; expected N + 1 = {N + 1} rising times in [0, {T:g}]")
+        if self.horizon is None and t[-1] < T * (1 - 1e-9):
+            raise ValueError(f"nodes end at {t[-1]:g}; expected {T:g}, the horizon: give NMPC a shorter `horizon`")
+        return t
+
+    def _run_key(self, x0: Array, t: Array, given: list[list[Guess]], *counts: int) -> str:
+        """A fingerprint of all that outcomes depend on."""
+        arrays = [part for guess in given for row in guess for part in row]
+        return fingerprint(self.key, x0, t, *arrays, counts, self.passes, self.neighbours, self.seed, version("casadi"),
+                           version("nocl"))
+
+
+@dataclass(frozen=True)
+class _Recipe:
+    """What a program is built from, known by its key alone."""
+
+    key: str
+    nmpc: NMPC = field(compare=False)
+
+
+@lru_cache(maxsize=KEPT)
+def _program(recipe: _Recipe) -> Transcription:
+    m = recipe.nmpc
+    return Transcription(m.ocp, dynamics_function(m.ocp, m.dynamics), int(m.intervals), int(m.substeps),
+                         m.constraints == "soft", m.solver, tuple(sorted((m.options or {}).items())), m.terminal,
+                         None if m.compiled is False else target(folder_of(m.compiled), m.key))
+
+
+@lru_cache(maxsize=KEPT)
+def _lqr(ocp: OCP) -> LQR | None:
+    return starting.lqr_of(ocp)
+
+
+def _terminal(ocp: OCP, terminal: Any) -> ca.Function | None:
+    """The terminal cost as a casadi.Function (x) or (x, t) -> number."""
+    if terminal is None:
+        return None
+    g = terminal.value_to_casadi() if hasattr(terminal, "value_to_casadi") else terminal
+    if not isinstance(g, ca.Function):
+        raise ValueError(f"NMPC: terminal is a {type(terminal).__name__}; expected a casadi.Function (x) or (x, t) -> "
+                         "cost, or an object with value_to_casadi()")
+    sizes = [g.numel_in(i) for i in range(g.n_in())]
+    if sizes not in ([ocp.system.nx], [ocp.system.nx, 1]) or g.numel_out(0) != 1:
+        raise ValueError(f"NMPC: terminal {g.name()} takes vectors of length {sizes} and returns {g.numel_out(0)}; "
+                         f"expected (x [{ocp.system.nx}]) or (x, t) -> one number")
+    return g
+
+
+@dataclass(frozen=True)
+class _Job:
+    """What a worker does with a task."""
+
+    nmpc: NMPC
+
+    def build(self) -> None:
+        self.nmpc.program.solver  # noqa: B018
+
+    def __call__(self, task: Task) -> Outcome:
+        program, guesses = self.nmpc.program, list(task.guesses)
+        if task.starts:
+            guesses += starting.starts(program, _lqr(self.nmpc.ocp), task.x0, task.t, task.starts, task.seed)
+        return attempt(program, task, guesses)
+
+
+class _Run:
+    """One call of solve: a search for each state, fed by tasks."""
+
+    def __init__(self, nmpc: NMPC, x0: Array, t: Array, pool: Pool, journal: Journal, show: bool) -> None:
+        self.nmpc, self.x0, self.t, self.pool, self.journal, self.show = nmpc, x0, t, pool, journal, show
+        self.searches = [Search(nmpc.program, x) for x in x0]
+
+    def first(self, guesses: list[list[Guess]], starts: int, warm: int) -> None:
+        """Each state from the guesses given, `warm` of them solutions, then from the built-in starts."""
+        self._do([Task(f"start-{i:06d}", i, self.x0[i], self.t, guesses[i], warm, starts, self.nmpc.seed)
+                  for i, search in enumerate(self.searches) if not search.refusal], "NMPC")
+
+    def exchange(self) -> None:
+        """Each state again from its nearest neighbours' solutions, until nothing improves or `passes` rounds."""
+        tried: set[tuple[int, int, int, float]] = set()
+        order = [list(self._nearest(i)) for i in range(len(self.x0))] if self.nmpc.passes else []
+        for round_ in range(1, self.nmpc.passes + 1):
+            tasks = [Task(f"round-{round_}-{i:06d}", i, self.x0[i], self.t, guesses)
+                     for i, search in enumerate(self.searches)
+                     if not search.refusal and (guesses := [*self._from_neighbours(i, order[i], tried),
+                                                            *self._from_afar(i, round_), *self._fresh(i, round_)])]
+            before = [search.cost for search in self.searches]
+            self._do(tasks, f"neighbours, round {round_}")
+            if not any(search.cost < cost - max(BETTER * abs(search.cost), TINY)
+                       for search, cost in zip(self.searches, before, strict=True)):
+                return
+
+    def _nearest(self, i: int) -> Iterator[tuple[int, int]]:
+        """(state, mirror image of it, or -1 for the state itself), by their distance from state i; never itself."""
+        scale = np.where(np.ptp(self.x0, axis=0) > 0, np.ptp(self.x0, axis=0), 1.0)
+        u = np.zeros(self.nmpc.ocp.system.nu)
+        images = [self.x0] + [starting.mirrored(self.nmpc.ocp, g, self.x0, u)[0] for g in self.nmpc.mirrors]
+        distance = np.linalg.norm((np.array(images) - self.x0[i]) / scale, axis=2)  # [1 + mirrors, B]
+        for place in np.argsort(distance, axis=None, kind="stable"):
+            image, j = divmod(int(place), len(self.x0))
+            if (image, j) != (0, i):
+                yield j, image - 1
+
+    def _from_neighbours(self, i: int, order: list[tuple[int, int]],
+                         tried: set[tuple[int, int, int, float]]) -> Iterator[Guess]:
+        solved = [(j, image) for j, image in order if self.searches[j].best is not None]
+        for j, image in solved[: self.nmpc.neighbours]:
+            answer = self.searches[j].best
+            if answer is None or (i, j, image, answer.cost) in tried:
+                continue
+            tried.add((i, j, image, answer.cost))
+            x, u = answer.x, answer.u
+            if image >= 0:
+                x, u = starting.mirrored(self.nmpc.ocp, self.nmpc.mirrors[image], x, u)
+            yield starting.from_neighbour(self.x0[i], x, u)
+
+    def _from_afar(self, i: int, round_: int) -> Iterator[Guess]:
+        """The solution of any other state: neighbours alone come to rest where a whole region shares a wrong basin."""
+        rng = np.random.default_rng((self.nmpc.seed, round_, i))
+        others = [j for j, search in enumerate(self.searches) if j != i and search.best is not None]
+        if others:
+            answer = self.searches[rng.choice(others)].best
+            assert answer is not None
+            yield starting.from_neighbour(self.x0[i], answer.x, answer.u)
+
+    def _fresh(self, i: int, round_: int) -> Iterator[Guess]:
+        """More random controls for a state of whose solves few ended at its best."""
+        nmpc, search = self.nmpc, self.searches[i]
+        if search.hits < SURE * len(search.costs):
+            seed = int(np.random.default_rng((nmpc.seed, round_, i, 1)).integers(2**62))
+            for u in starting.random_controls(nmpc.ocp, nmpc.intervals, FRESH, seed):
+                yield starting.controlled(nmpc.program, self.x0[i], u, self.t)
+
+    def _do(self, tasks: Sequence[Task], what: str) -> None:
+        for outcome in do(_Job(self.nmpc), tasks, self.pool, self.journal, self.show, what):
+            self.searches[outcome.row].add(outcome)
+
+
+def _collect(searches: list[Search], t: Array) -> Solution:
+    """One row for each search; NaN where there is no solution."""
+    p = searches[0].program
+    s, N, B = p.ocp.system, p.N, len(searches)
+    x, u = np.full((B, N + 1, s.nx), np.nan), np.full((B, N, s.nu), np.nan)
+    costate, between = np.full((B, N + 1, s.nx), np.nan), np.full((B, N, 4, 2 * s.nx), np.nan)
+    for i, search in enumerate(searches):
+        if search.best is not None:
+            x[i], u[i], costate[i] = search.best.x, search.best.u, search.best.costate
+            between[i] = dense(p, t, x[i], u[i], costate[i])
+    return Solution(
+        Trajectory(t, x, u), cost=np.array([e.cost for e in searches]), costate=costate,
+        success=np.array([e.best is not None for e in searches]), message=[e.message for e in searches],
+        seconds=np.array([e.seconds for e in searches]), iterations=np.array([e.iterations for e in searches]),
+        starts=np.array([len(e.costs) for e in searches]), hits=np.array([e.hits for e in searches]),
+        optima=[e.optima for e in searches], dense=between)
+
+
+def _is_solution(guess: Any) -> bool:
+    return isinstance(guess, (Solution, Trajectory))
+
+
+def _given(guess: Any, nmpc: NMPC, x0: Array, t: Array) -> list[Guess]:
+    """A user's guess, checked: states and controls for each x0."""
+    s, N, B = nmpc.ocp.system, nmpc.intervals, len(x0)
+    if callable(guess) and not isinstance(guess, Solution):
+        return [starting.controller_rollout(nmpc.program, guess, row, t) for row in x0]
+    x, u = (guess.x, guess.u) if hasattr(guess, "x") and hasattr(guess, "u") else \
+        guess if isinstance(guess, tuple) else (None, guess)
+    u = _shaped(u, (B, N, s.nu), "the guess's u", "[B, N, nu]")
+    if x is not None:
+        return list(zip(_shaped(x, (B, N + 1, s.nx), "the guess's x", "[B, N+1, nx]"), u, strict=True))
+    return [_rollout(nmpc.program, row, v, t) for row, v in zip(x0, u, strict=True)]
+
+
+def _rollout(program: Transcription, x0: Array, u: Array, t: Array) -> Guess:
+    rolled = np.vstack([x0, program.rollout(x0, u.T, np.diff(t)[None]).full().T])
+    return (rolled if np.isfinite(rolled).all() else np.tile(x0, (len(u) + 1, 1))), u
+
+
+def _shaped(value: ArrayLike, shape: tuple[int, ...], what: str, form: str) -> Array:
+    array = np.asarray(value, dtype=np.float64)
+    if array.ndim == 2 and shape[0] == 1:
+        array = array[None]
+    if array.shape != shape:
+        raise ValueError(f"{what} has shape {array.shape}; expected {form} = {list(shape)}, a row for each x0")
+    if not np.isfinite(array).all():
+        row = int(np.flatnonzero(~np.isfinite(array).all(axis=(1, 2)))[0])
+        raise ValueError(f"{what} is not finite in row {row}; expected numbers: leave out rows without a solution")
+    return array

@@ -1,0 +1,236 @@
+"""Multiple shooting: an OCP as a nonlinear program with the structure that fatrop needs, and back.
+
+Variables w = [x_0, u_0, x_1, u_1, ..., x_N], parameters p = [x_0, h_0, ..., h_{N-1}, t_N], the lengths of the
+intervals and the time of the last node.
+Constraints, stage by stage: x_{k+1} - F(x_k, u_k; h_k) = 0, then x_0 - p = 0 at k = 0 and h(x_k) >= 0 at k >= 1. A
+gap's multiplier is minus the costate of the node that it leads to: lambda_{k+1} = dJ*/dx_{k+1}.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from nocl.ocp import OCP
+from nocl.support import interrupt
+from nocl.support.checks import Array
+from nocl.support.compiler import build
+from nocl.translate.rk4 import rk4_cost, rk4_interval
+
+BACKENDS: dict[str, dict[str, Any]] = {
+    "ipopt": {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-9, "ipopt.max_iter": 500},
+    "fatrop": {"fatrop.print_level": 0, "fatrop.tol": 1e-9, "fatrop.max_iter": 500},
+}
+WARM: dict[str, dict[str, Any]] = {  # near a solution: a barrier that is small from the start does not push it away
+    "ipopt": {"ipopt.mu_init": 1e-8, "ipopt.warm_start_init_point": "yes", **{
+        f"ipopt.warm_start_{name}": 1e-8 for name in ("bound_push", "bound_frac", "slack_bound_push",
+                                                      "slack_bound_frac", "mult_bound_push")}},
+    "fatrop": {"fatrop.mu_init": 1e-8},
+}
+FEASIBLE = 1e-6  # largest violation of a constraint in a solution, in the constraint's own unit
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """One solve of one program."""
+
+    x: Array  # [N+1, nx]
+    u: Array  # [N, nu]
+    costate: Array  # [N+1, nx]
+    cost: float  # inf where it failed
+    success: bool
+    message: str
+    violation: float  # the largest, of any constraint
+    iterations: int
+
+
+@dataclass(frozen=True, eq=False)
+class Transcription:
+    """The program of an OCP under dynamics f on N intervals; built when first used, so that settings travel alone."""
+
+    ocp: OCP
+    f: ca.Function  # (x, u) -> xdot
+    N: int
+    substeps: int = 1
+    soft: bool = False  # path constraints as the penalty of ocp.L_soft, not as constraints
+    backend: str = "ipopt"
+    options: tuple[tuple[str, Any], ...] = ()
+    terminal: ca.Function | None = None  # (x) or (x, t) -> cost at the last node; default: G
+    binary: Path | None = None  # of compiled functions, built where it is missing; default: none, CasADi interprets
+
+    @property
+    def L(self) -> ca.Function:
+        """(x, u) -> running cost, with the penalty where `soft`."""
+        return self.ocp.L_soft if self.soft else self.ocp.L
+
+    def end_cost(self, x: Any, t: Any) -> Any:
+        """What the state x at the last node, at time t, costs."""
+        if self.terminal is None:
+            return self.ocp.G(x)
+        return self.terminal(*(x, t)[: self.terminal.n_in()])
+
+    @property
+    def sym(self) -> Any:
+        """SX.sym, or MX.sym where the dynamics are MX."""
+        return ca.SX.sym if self.f.is_a("SXFunction") else ca.MX.sym
+
+    @property
+    def expandable(self) -> bool:
+        return all(g is None or g.is_a("SXFunction") for g in (self.f, self.terminal))
+
+    @property
+    def n_path(self) -> int:
+        """Path constraints at each node."""
+        return 0 if self.soft else len(self.ocp.path_constraints)
+
+    @cached_property
+    def step(self) -> ca.Function:
+        """(x, u, h) -> (x at the end of the interval, integral of L over it)."""
+        s = self.ocp.system
+        x, u, h = self.sym("x", s.nx), self.sym("u", s.nu), self.sym("h")
+        end, cost = rk4_cost(self.f, self.L, x, u, h, self.substeps)
+        return ca.Function("step", [x, u, h], [end, cost], ["x", "u", "h"], ["end", "cost"])
+
+    @cached_property
+    def rollout(self) -> ca.Function:
+        """(x0, u [nu, N], h [1, N]) -> x_1 ... x_N [nx, N]."""
+        s = self.ocp.system
+        x, u, h = self.sym("x", s.nx), self.sym("u", s.nu), self.sym("h")
+        return ca.Function("F", [x, u, h], [rk4_interval(self.f, x, u, h, self.substeps)]).mapaccum(self.N)
+
+    @cached_property
+    def program(self) -> dict[str, ca.MX]:
+        """x, p, f, g of the nonlinear program, in MX."""
+        s, N = self.ocp.system, self.N
+        X, U, p = ca.MX.sym("x", s.nx, N + 1), ca.MX.sym("u", s.nu, N), ca.MX.sym("p", s.nx + N + 1)
+        ends, costs = self.step.map(N)(X[:, :-1], U, p[s.nx: -1].T)
+        gaps = ca.horzsplit(X[:, 1:] - ends)
+        paths = [X[:, 0] - p[: s.nx], *([self.ocp.h(X[:, k]) for k in range(1, N + 1)] if self.n_path else [])]
+        w = ca.vertcat(*(v for k in range(N) for v in (X[:, k], U[:, k])), X[:, N])
+        g = ca.vertcat(*(v for k in range(N) for v in (gaps[k], *paths[k: k + 1])), *paths[N:])
+        flat = ca.Function("flat", [X, U, p], [w, ca.sum2(costs) + self.end_cost(X[:, N], p[-1]), g])
+        w_sym = ca.MX.sym("w", w.numel())
+        states, controls = self.split(w_sym)
+        _, cost, constraints = flat(states, controls, p)
+        return {"x": w_sym, "p": p, "f": cost, "g": constraints}
+
+    def split(self, w: Any) -> tuple[Any, Any]:
+        """(X [nx, N+1], U [nu, N]) of the interleaved variables."""
+        s = self.ocp.system
+        n = s.nx + s.nu
+        inner = ca.reshape(w[: n * self.N], n, self.N)
+        return ca.horzcat(inner[: s.nx, :], w[n * self.N:]), inner[s.nx:, :]
+
+    @cached_property
+    def solver(self) -> ca.Function:
+        """The nlpsol, with exact Hessians."""
+        if self.binary is None:
+            return self._nlpsol(self.program, {"expand": self.expandable})
+        if not self.binary.exists():
+            build(self._nlpsol(self.program, {}), self.binary)  # not expanded: loops over the intervals stay loops
+        return self._nlpsol(str(self.binary), {})
+
+    def _nlpsol(self, problem: Any, options: dict[str, Any]) -> ca.Function:
+        s, N, m = self.ocp.system, self.N, self.n_path
+        options = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False, **options,
+                   **BACKENDS.get(self.backend, {})}
+        if self.backend == "fatrop":
+            options |= {"structure_detection": "manual", "N": N, "nx": [s.nx] * (N + 1), "nu": [s.nu] * N + [0],
+                        "ng": [s.nx] + [m] * N}
+        try:
+            return ca.nlpsol("nmpc", self.backend, problem, {**options, **dict(self.options)})
+        except RuntimeError as error:
+            reason = str(error).strip().splitlines()[-1]
+            raise ValueError(f"NMPC: {self.backend} could not be built with options {dict(self.options)}: {reason}; "
+                             "give options by CasADi's names, like {'ipopt.tol': 1e-6}") from error
+
+    @cached_property
+    def bounds(self) -> dict[str, Array]:
+        s, N, m = self.ocp.system, self.N, self.n_path
+        free = np.full(s.nx, np.inf)
+        stage = np.concatenate([np.zeros(s.nx), np.full(m, np.inf)])
+        ubg = np.concatenate([np.zeros(2 * s.nx), np.tile(stage, N - 1), np.full(m, np.inf)])
+        return {"lbx": np.concatenate([np.tile(np.r_[-free, s.lbu], N), -free]),
+                "ubx": np.concatenate([np.tile(np.r_[free, s.ubu], N), free]),
+                "lbg": np.zeros(len(ubg)), "ubg": ubg}
+
+    @cached_property
+    def _limits(self) -> dict[str, ca.DM]:
+        """The bounds as CasADi takes them: converting them at each solve would take a millisecond."""
+        return {name: ca.DM(value) for name, value in self.bounds.items()}
+
+    @cached_property
+    def gap_rows(self) -> Array:
+        """Where x_0 - p and the gaps stand in g, [N+1, nx]."""
+        s, N, m = self.ocp.system, self.N, self.n_path
+        first = np.r_[s.nx, 0, 2 * s.nx + (s.nx + m) * np.arange(N - 1)]
+        return first[:, None] + np.arange(s.nx)
+
+    def solve(self, x0: Array, t: Array, x: Array, u: Array) -> Answer:
+        """Solve from x0 on the nodes t [N+1] with the guess x [N+1, nx], u [N, nu]."""
+        w0 = np.r_[np.c_[x[:-1], u].ravel(), x[-1]]
+        solver, p = self.solver, np.r_[x0, np.diff(t), t[-1]]
+        with interrupt.deferred():
+            result = solver(x0=w0, p=p, **self._limits)
+        stats = solver.stats()
+        X, U = (v.full().T for v in self.split(result["x"]))
+        U = np.clip(U, self.ocp.system.lbu, self.ocp.system.ubu)  # IPOPT relaxes bounds by 1e-8
+        costate = -result["lam_g"].full().ravel()[self.gap_rows]
+        worst, where = self.violation(result["g"].full().ravel(), t)
+        iterations = int(stats.get("iter_count", 0))
+        status = words(stats, iterations >= self.max_iter)
+        success = bool(stats["success"] and worst <= FEASIBLE and np.isfinite(X).all())
+        if not success:
+            status += f"; worst violation {worst:.3g} of {where}" if worst > FEASIBLE else \
+                ", at a feasible point that may not be optimal"
+        cost = float(result["f"]) if success else np.inf
+        return Answer(X, U, costate, cost, success, status, worst, iterations)
+
+    @property
+    def max_iter(self) -> float:
+        """The solver's limit of iterations, where it is known."""
+        name = f"{self.backend}.max_iter"
+        return float(dict(self.options).get(name, BACKENDS.get(self.backend, {}).get(name, np.inf)))
+
+    @cached_property
+    def warm(self) -> Transcription:
+        """The same program for guesses that are solutions of problems nearby."""
+        return replace(self, options=tuple({**WARM.get(self.backend, {}), **dict(self.options)}.items()))
+
+    @cached_property
+    def second(self) -> Transcription:
+        """The same program for IPOPT, which tells an infeasible problem from an unfinished solve."""
+        return replace(self, backend="ipopt", options=(), binary=None)
+
+    def violation(self, g: Array, t: Array) -> tuple[float, str]:
+        """(largest violation of a constraint, which one: what, state, node, time)."""
+        s = self.ocp.system
+        excess = np.maximum(self.bounds["lbg"] - g, g - self.bounds["ubg"])
+        excess = np.where(np.isnan(excess), np.inf, excess)
+        row = int(np.argmax(excess))
+        node, state = np.argwhere(self.gap_rows == row)[0] if (self.gap_rows == row).any() else (-1, -1)
+        if node >= 0:
+            what = f"the dynamics of {s.state_names[state]}"
+        else:
+            path = np.setdiff1d(np.arange(len(g)), self.gap_rows)  # node by node, from node 1
+            i = int(np.flatnonzero(path == row)[0])
+            node, what = 1 + i // self.n_path, f"path constraint {list(self.ocp.path_constraints)[i % self.n_path]!r}"
+        return float(excess[row]), f"{what} at node {node}, t = {t[node]:.4g}"
+
+
+def words(stats: dict[str, Any], limited: bool = False) -> str:
+    """The solver's status in words: solved, infeasible, out of iterations ...; limited: it used all its iterations."""
+    status, unified = stats.get("return_status", ""), str(stats.get("unified_return_status", ""))
+    plain = {"SOLVER_RET_SUCCESS": "solved", "SOLVER_RET_LIMITED": "stopped at its limit of iterations or time",
+             "SOLVER_RET_INFEASIBLE": "infeasible", "SOLVER_RET_NAN": "NaN in a function",
+             "SOLVER_RET_UNKNOWN": "not converged"}.get(unified, unified.lower())
+    if "Infeasible" in str(status):
+        plain = "infeasible"
+    elif limited and not stats.get("success"):
+        plain = "stopped at its limit of iterations"
+    return f"{plain} ({status})" if isinstance(status, str) and status else plain
