@@ -1,7 +1,7 @@
 """System identification: f_theta, a network that answers like xdot = f(x, u), from labels of f and its Jacobians.
 
-The default recipe reads the structure off the Jacobian labels first (nocl.sysid.structure): what is exactly known is kept
-in closed form, and each group of entries with the same variables gets one small network, fitted to values and
+The default recipe reads the structure off the Jacobian labels first (nocl.sysid.structure): what is exactly known is
+kept in closed form, and each group of entries with the same variables gets one small network, fitted to values and
 derivatives (nocl.sysid.fitting). Where there is no structure to find, one network learns everything.
 """
 
