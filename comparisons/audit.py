@@ -15,7 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nocl.comparisons.report.findings import MethodAudit, Rollouts, ValueAudit
-from nocl.comparisons.report.results import COST_FLOOR, REFERENCE, Judged, Report
+from nocl.comparisons.report.report import Report
+from nocl.comparisons.report.results import (
+    COST_FLOOR,
+    REFERENCE,
+    Judged,
+)
 from nocl.judge import AT_BOUND, dynamics_function, policy_function
 from nocl.ocp import OCP
 from nocl.solvers.nmpc.loop import Loop

@@ -18,7 +18,10 @@ from numpy.typing import ArrayLike
 
 from nocl.comparisons.judging import Disturbance, Judgement, Judging, judge
 from nocl.comparisons.methods import Run, Solving, checked, is_count, rates_of, runs_of
-from nocl.comparisons.report.results import Judged, Report
+from nocl.comparisons.report.report import Report
+from nocl.comparisons.report.results import (
+    Judged,
+)
 from nocl.ocp import OCP
 from nocl.support import checks
 from nocl.support.checks import Array

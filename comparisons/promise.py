@@ -7,7 +7,10 @@ Biometrika 26(4): the bounds hold for every n and share, with at least the confi
 from __future__ import annotations
 
 from nocl.comparisons.report.findings import Promise
-from nocl.comparisons.report.results import REFERENCE, Report
+from nocl.comparisons.report.report import Report
+from nocl.comparisons.report.results import (
+    REFERENCE,
+)
 
 WITHIN = 2.0  # per cent of the best known cost
 CONFIDENCE = 0.99

@@ -17,7 +17,10 @@ import numpy as np
 from scipy.integrate import solve_ivp
 
 from nocl.comparisons.report.findings import Stability
-from nocl.comparisons.report.results import REFERENCE, Report
+from nocl.comparisons.report.report import Report
+from nocl.comparisons.report.results import (
+    REFERENCE,
+)
 from nocl.judge import policy_function
 from nocl.ocp import OCP
 from nocl.solvers.ddp.solver import DDP

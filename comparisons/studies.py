@@ -16,7 +16,7 @@ from nocl.comparisons.disturbances import Disturbances, robustness
 from nocl.comparisons.promise import promises
 from nocl.comparisons.reference import NAME, Reference
 from nocl.comparisons.region import region
-from nocl.comparisons.report.results import Report
+from nocl.comparisons.report.report import Report
 from nocl.comparisons.stability import stability
 from nocl.judge import policy_function
 from nocl.ocp import OCP

@@ -12,6 +12,7 @@ from nocl.system import System
 if TYPE_CHECKING:
     from nocl.data import Dataset, Solution, Trajectory
     from nocl.exports.casadi_forms import to_casadi
+    from nocl.exports.interop import to_acados, to_control, to_do_mpc, to_gymnasium
     from nocl.judge import simulate
     from nocl.solvers.cnd.controller import CND, pretrained
     from nocl.solvers.cnd.training import train
@@ -23,7 +24,8 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = ["CND", "OCP", "Dataset", "Ensemble", "Gaussian", "LearnedDynamics", "Log", "Solution", "System",
-           "Trajectory", "Uniform", "identify", "load_ocp", "pretrained", "simulate", "to_casadi", "to_torch", "train"]
+           "Trajectory", "Uniform", "identify", "load_ocp", "pretrained", "simulate", "to_acados", "to_casadi",
+           "to_control", "to_do_mpc", "to_gymnasium", "to_torch", "train"]
 
 _LAZY = {  # public name -> module: torch and the solvers are imported when first used
     "CND": "nocl.solvers.cnd.controller", "train": "nocl.solvers.cnd.training",
@@ -33,6 +35,8 @@ _LAZY = {  # public name -> module: torch and the solvers are imported when firs
     "Dataset": "nocl.data", "Solution": "nocl.data", "Trajectory": "nocl.data",
     "load_ocp": "nocl.systems", "simulate": "nocl.judge",
     "to_torch": "nocl.translate.torch_functions", "to_casadi": "nocl.exports.casadi_forms",
+    "to_acados": "nocl.exports.interop", "to_control": "nocl.exports.interop", "to_do_mpc": "nocl.exports.interop",
+    "to_gymnasium": "nocl.exports.interop",
 }
 _PACKAGES = ("comparisons", "exports", "solvers", "support", "sysid", "systems", "translate")  # nocl.solvers.NMPC(...)
 

@@ -200,12 +200,6 @@ class OCP:
         except (KeyError, TypeError, AttributeError, NotImplementedError, RuntimeError) as error:
             raise ValueError(f"not an OCP written by nocl: {type(error).__name__}: {error}") from error
 
-    def to_gymnasium(self, *, steps: int = 80, integrator: str = "rk4", observe_time: bool = True) -> Any:
-        """A gymnasium.Env whose return is minus this problem's cost: see nocl.exports.interop.to_gymnasium."""
-        from nocl.exports.interop import to_gymnasium
-
-        return to_gymnasium(self, steps=steps, integrator=integrator, observe_time=observe_time)
-
     def __reduce__(self) -> tuple[Any, ...]:
         return OCP.from_data, (self.to_data(),)  # bare SX does not pickle
 

@@ -201,33 +201,34 @@ class System:
 
     @staticmethod
     def from_casadi(f: ca.Function, *, lbu: Vector, ubu: Vector, lbx: Vector, ubx: Vector, **options: Any) -> System:
-        """The system of f:(x [nx], u [nu]) -> xdot [nx]; options: name, states, controls (names), angles, units."""
-        from nocl.exports.interop import system_from_casadi
+        """The system of f:(x [nx], u [nu]) -> xdot [nx]; options: name, states, controls (names), angles, units.
 
-        return system_from_casadi(f, lbu=lbu, ubu=ubu, lbx=lbx, ubx=ubx, **options)
-
-    def to_control(self, x: ArrayLike | None = None, u: ArrayLike | None = None) -> Any:
-        """python-control's NonlinearIOSystem; with (x, u) the StateSpace of the linearisation there."""
-        from nocl.exports import interop
-
-        if (x is None) != (u is None):
-            raise ValueError(f"{self.name}.to_control: got one of x and u; expected both, or neither")
-        return interop.to_control(self) if x is None or u is None else interop.to_statespace(self, x, u)
-
-    def to_do_mpc(self) -> Any:
-        """do-mpc's continuous Model of the system, set up."""
-        from nocl.exports.interop import to_do_mpc
-
-        return to_do_mpc(self)
-
-    def to_acados(self) -> Any:
-        """acados' AcadosModel of the same equations (needs acados_template)."""
-        from nocl.exports.interop import to_acados
-
-        return to_acados(self)
+        f is written out in SX: elementary operations only (ValueError for externals, integrators, look-up tables).
+        Names of states and controls are x0, x1, ..., u0, ... by default.
+        """
+        return _from_casadi(f, lbu=lbu, ubu=ubu, lbx=lbx, ubx=ubx, **options)
 
     def __reduce__(self) -> tuple[Any, ...]:
         return System.from_data, (self.to_data(),)  # bare SX does not pickle
+
+
+def _from_casadi(f: ca.Function, *, name: str | None = None, states: Sequence[str] | None = None,
+                 controls: Sequence[str] | None = None, **options: Any) -> System:
+    if not isinstance(f, ca.Function) or f.n_in() != 2 or f.n_out() != 1 or f.size_out(0) != f.size_in(0) or \
+            f.size2_in(0) != 1 or f.size2_in(1) != 1:
+        raise ValueError(f"System.from_casadi: got {f}; expected a casadi.Function (x [nx], u [nu]) -> xdot [nx] of "
+                         "columns")
+    x = _named(states, f.size1_in(0), "x", "states", f.name())
+    u = _named(controls, f.size1_in(1), "u", "controls", f.name())
+    return System(name or f.name(), x=x, u=u, xdot=instructions.expand(f)(x, u), **options)
+
+
+def _named(names: Sequence[str] | None, n: int, letter: str, what: str, owner: str) -> ca.SX:
+    """A column of n symbols: `names`, or x0, x1, ..."""
+    chosen = [f"{letter}{i}" for i in range(n)] if names is None else list(names)
+    if len(chosen) != n:
+        raise ValueError(f"System.from_casadi: {what} has {len(chosen)} names; {owner} has {n}: name each")
+    return ca.vertcat(*map(ca.SX.sym, chosen))
 
 
 def counted(n: int, noun: str) -> str:

@@ -156,11 +156,11 @@ def test_files_that_are_no_controller_are_refused(cnd, tmp_path):
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(ValueError, match="cut off"):
         CND.load(tmp_path / "cut")
-    foreign = nocl.support.store.save(tmp_path / "foreign", "dynamics", nets={"net": cnd.policy})
+    foreign = nocl.records.save(tmp_path / "foreign", "dynamics", nets={"net": cnd.policy})
     shutil.move(foreign, foreign.with_name("cnd.safetensors"))
     with pytest.raises(ValueError, match="is a 'dynamics' of nocl's"):
         CND.load(tmp_path / "foreign")
-    nocl.support.store.save(tmp_path / "odd", "cnd", nets={"policy": cnd.policy}, card={"ocp": cnd.ocp.to_data()})
+    nocl.records.save(tmp_path / "odd", "cnd", nets={"policy": cnd.policy}, card={"ocp": cnd.ocp.to_data()})
     with pytest.raises(ValueError, match="'card' is missing"):
         CND.load(tmp_path / "odd")
 

@@ -21,11 +21,11 @@ def ocp():
 
 def test_control_has_the_same_dynamics_and_linearisation(ocp):
     control, s = pytest.importorskip("control"), ocp.system
-    plant = s.to_control()
+    plant = nocl.to_control(s)
     x, u = np.array([0.1, -0.2, 0.3, 0.4]), np.array([0.5])
     np.testing.assert_allclose(plant.dynamics(0, x, u), s.f(x, u).full().ravel(), rtol=1e-14)
     assert (plant.state_labels, plant.input_labels) == (list(s.state_names), list(s.control_names))
-    linear = s.to_control(x, u)
+    linear = nocl.to_control(s, x, u)
     A, B = s.linearize(x, u)
     np.testing.assert_array_equal(linear.A, A)
     np.testing.assert_array_equal(linear.B, B)
@@ -35,7 +35,7 @@ def test_control_has_the_same_dynamics_and_linearisation(ocp):
     run = nocl.simulate(ocp, np.full((1, 40, 1), 0.5), x)
     np.testing.assert_allclose(response.states[:, -1], run.x[0, 10], atol=1e-5)
     with pytest.raises(ValueError, match="expected both"):
-        s.to_control(x)
+        nocl.to_control(s, x)
 
 
 @pytest.mark.parametrize("problem", ["cartpole", "dubins"])
@@ -44,7 +44,7 @@ def test_gymnasium_accepts_the_environment(problem, integrator):
     pytest.importorskip("gymnasium")
     from gymnasium.utils.env_checker import check_env
 
-    env = nocl.load_ocp(problem).to_gymnasium(steps=20, integrator=integrator)
+    env = nocl.to_gymnasium(nocl.load_ocp(problem), steps=20, integrator=integrator)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message=".*(infinity|symmetric and normalized|spec).*")
@@ -54,7 +54,7 @@ def test_gymnasium_accepts_the_environment(problem, integrator):
 @pytest.mark.parametrize("integrator", ["rk4", "cvodes"])
 def test_the_return_is_minus_the_cost(ocp, integrator):
     pytest.importorskip("gymnasium")
-    env = ocp.to_gymnasium(steps=40, integrator=integrator)
+    env = nocl.to_gymnasium(ocp, steps=40, integrator=integrator)
     x0, u = ocp.initial_states.sample(1, 3)[0], np.random.default_rng(0).uniform(-4, 4, (40, 1))
     observation, info = env.reset(options={"x0": x0})
     np.testing.assert_array_equal(observation, [*x0, 0])
@@ -84,7 +84,7 @@ def test_the_return_is_minus_the_cost(ocp, integrator):
 
 def test_initial_states_are_the_problems(ocp):
     pytest.importorskip("gymnasium")
-    env = ocp.to_gymnasium(observe_time=False)
+    env = nocl.to_gymnasium(ocp, observe_time=False)
     first, _ = env.reset(seed=7)
     again, _ = env.reset(seed=7)
     np.testing.assert_array_equal(first, again)
@@ -113,7 +113,7 @@ def test_a_system_from_a_function(ocp):
 
 def test_do_mpc_gets_the_equations(ocp):
     pytest.importorskip("do_mpc")
-    model = ocp.system.to_do_mpc()
+    model = nocl.to_do_mpc(ocp.system)
     assert model.n_x == 4
 
 
@@ -125,7 +125,7 @@ def test_acados_gets_the_equations(ocp, monkeypatch):
         import acados_template  # noqa: F401
     except ImportError:
         monkeypatch.setitem(sys.modules, "acados_template", SimpleNamespace(AcadosModel=AcadosModel))
-    model, f = ocp.system.to_acados(), ocp.system.f
+    model, f = nocl.to_acados(ocp.system), ocp.system.f
     equations = ca.Function("equations", [model.x, model.u, model.xdot], [model.f_expl_expr, model.f_impl_expr])
     x, u = np.array([0.1, 0.2, 0.3, 0.4]), 0.5
     explicit, implicit = equations(x, u, f(x, u))
@@ -137,7 +137,7 @@ def test_acados_gets_the_equations(ocp, monkeypatch):
 @pytest.mark.parametrize("options", [{"steps": 0}, {"integrator": "euler"}])
 def test_refusals(ocp, options):
     with pytest.raises(ValueError, match=next(iter(options))):
-        ocp.to_gymnasium(**options)
+        nocl.to_gymnasium(ocp, **options)
 
 
 def test_missing_packages_say_how_to_install_them(ocp, monkeypatch):

@@ -1,23 +1,23 @@
-"""The layers of docs/design.md, read from the imports: core <- systems, solvers <- comparisons <- cli."""
+"""The layers of docs/design.md, read from the imports: between folders they go one way, and files make no circle.
+
+Every import counts, also those inside functions and those for type checkers. Only the lazy hand-on of public names in
+an `__init__.py` does not, nor what starts the program, `__main__.py`.
+"""
 
 import ast
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = {"systems": "nocl.systems", "solvers": "nocl.solvers", "comparisons": "nocl.comparisons"}
-CHAIN = ["lqr", "nmpc", "ddp", "cnd"]  # a solver may use those before it
-# files that are part of a link of the chain
-PARTS = {**dict.fromkeys(("transcription", "guesses", "search", "pool", "sensitivity", "loop", "compiled"), "nmpc"),
-         **dict.fromkeys(("ddp_kernel", "ddp_numpy", "ddp_batch", "bank", "global_search"), "ddp"),
-         "levelset_scheme": "levelset"}
-MAY_IMPORT = {"core": {"core"}, "systems": {"core", "systems"}, "solvers": {"core", "solvers"},
-              "comparisons": {"core", "systems", "solvers", "comparisons"},
-              "top": {"core", "systems", "solvers", "comparisons", "top"}}
+MOST = 17  # files of a folder, __init__.py aside
+START = "nocl.__main__"
+HEAVY = {"torch", "matplotlib", "plotly", "jax", "onnx", "onnxruntime", "l4casadi", "gymnasium", "control", "ompl",
+         "pyarrow", "distributed", "scipy", "tqdm"}
 
 
 def files() -> dict[str, Path]:
@@ -33,90 +33,110 @@ def files() -> dict[str, Path]:
 FILES = files()
 
 
-def imports(name: str, top_level: bool = False) -> Iterator[str]:
-    """The modules that a module imports: everywhere, or only when it is itself imported."""
-    todo: list[ast.AST] = [ast.parse(FILES[name].read_text())]
-    while todo:
-        node = todo.pop()
+def is_package(name: str) -> bool:
+    return FILES[name].name == "__init__.py"
+
+
+def folder(name: str) -> str:
+    return name if is_package(name) else name.rpartition(".")[0]
+
+
+def module_of(name: str) -> str:
+    """The module that a dotted name stands in."""
+    while name not in FILES:
+        name = name.rpartition(".")[0]
+    return name
+
+
+def imports(name: str) -> Iterator[tuple[str, str]]:
+    """(module, as written) of each import of nocl's, wherever it stands."""
+    for node in ast.walk(ast.parse(FILES[name].read_text())):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            yield from from_import(name, node)
-        elif not (top_level and (isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) or is_type_checking(node))):
-            todo.extend(ast.iter_child_nodes(node))
+            yield from ((module_of(a.name), a.name) for a in node.names if a.name.partition(".")[0] == "nocl")
+        elif isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "nocl":
+            yield from ((module_of(f"{node.module}.{a.name}"), f"{node.module}.{a.name}") for a in node.names)
 
 
-def from_import(name: str, node: ast.ImportFrom) -> list[str]:
-    package = name if FILES[name].name == "__init__.py" else name.rpartition(".")[0]
-    base = node.module or ""
-    if node.level:
-        base = ".".join([*package.split(".")[: len(package.split(".")) - node.level + 1], *filter(None, [node.module])])
-    return [f"{base}.{a.name}" if f"{base}.{a.name}" in FILES else base for a in node.names]
+def handed_on(name: str) -> bool:
+    return is_package(name) or name == START
 
 
-def is_type_checking(node: ast.AST) -> bool:
-    return isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+def graph() -> dict[str, set[str]]:
+    return {name: {t for t, _ in imports(name)} - {name} for name in FILES if not handed_on(name)}
 
 
-def layer(name: str) -> str:
-    if name in ("nocl.cli", "nocl.stages", "nocl.__main__"):
-        return "top"
-    parts = name.split(".")
-    return parts[1] if len(parts) > 1 and parts[1] in PACKAGES else "core"
+def circle(edges: Mapping[str, set[str]]) -> list[str]:
+    """A path that comes back to where it started, or []."""
+    done: set[str] = set()
+
+    def visit(node: str, path: list[str]) -> list[str]:
+        if node in path:
+            return [*path[path.index(node):], node]
+        if node in done:
+            return []
+        for target in sorted(edges.get(node, ())):
+            if found := visit(target, [*path, node]):
+                return found
+        done.add(node)
+        return []
+
+    return next((found for node in sorted(edges) if (found := visit(node, []))), [])
 
 
-def solver(name: str) -> str:
-    parts = name.split(".")
-    return parts[2] if len(parts) > 2 else ""
+def test_the_walk_sees_the_imports():
+    edges = graph()
+    assert "nocl.support.checks" in edges["nocl.system"]
+    assert {folder(n) for n in FILES} >= {"nocl", "nocl.support", "nocl.solvers.ddp", "nocl.comparisons.report"}
+    assert circle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c", "b"]
 
 
-def test_the_walk_sees_the_packages():
-    assert {layer(n) for n in FILES} >= {"core", "systems", "solvers", "comparisons"}
-    assert "nocl.checks" in set(imports("nocl.system"))
+def test_no_circle_of_files():
+    assert circle(graph()) == []
 
 
-@pytest.mark.parametrize("name", FILES)
-def test_imports_go_one_way(name):
-    for target in imports(name, top_level=name == "nocl"):  # the package hands names of all layers on, lazily
-        if target == "nocl" or not target.startswith("nocl."):
-            continue
-        assert layer(target) in MAY_IMPORT[layer(name)], f"{name} ({layer(name)}) imports {target} ({layer(target)})"
+def test_imports_between_folders_go_one_way():
+    edges: dict[str, set[str]] = {}
+    for name, targets in graph().items():
+        edges.setdefault(folder(name), set()).update({folder(t) for t in targets} - {folder(name)})
+    assert circle(edges) == []
+
+
+def test_no_folder_is_a_heap():
+    for name in {folder(n) for n in FILES}:
+        names = [p.stem for p in FILES[name].parent.glob("*.py") if p.name != "__init__.py"]
+        assert len(names) <= MOST, f"{name} has {len(names)} files: make a folder of those of one subject"
+        prefixed = [a for a in names for b in names if a.startswith(f"{b}_")]
+        assert not prefixed, f"{name}: {prefixed} are named by a prefix: name them by their subject, or make a folder"
+
+
+@pytest.mark.parametrize("name", [n for n in FILES if n.startswith("nocl.solvers.")])
+def test_a_solver_never_imports_a_system(name):
+    assert not [t for t, _ in imports(name) if t.startswith("nocl.systems")]
+
+
+@pytest.mark.parametrize("name", [n for n in FILES if not handed_on(n)])
+def test_names_come_from_the_module_that_defines_them(name):
+    """Not from a package that hands them on: that would hide an import from this test."""
+    through = [written for target, written in imports(name) if is_package(target) and target != written
+               and not defined_in(target, written.rpartition(".")[2])]
+    assert not through, f"{name} imports {through}: name the module that defines it"
+
+
+def defined_in(package: str, name: str) -> bool:
+    """Whether a package's own __init__.py defines a name, rather than handing it on."""
+    body = ast.parse(FILES[package].read_text()).body
+    defined = {n.name for n in body if isinstance(n, ast.FunctionDef | ast.ClassDef)}
+    assigned = {t.id for n in body if isinstance(n, ast.Assign) for t in n.targets if isinstance(t, ast.Name)}
+    return name in defined | (assigned - {"__getattr__", "__dir__"})
 
 
 @pytest.mark.parametrize("name", FILES)
 def test_packages_are_imported_by_their_nocl_name(name):
-    bare = [t for t in imports(name) if t.partition(".")[0] in PACKAGES]
+    tree = ast.parse(FILES[name].read_text())
+    names = [a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names]
+    names += [n.module or "" for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and not n.level]
+    bare = [t for t in names if t.partition(".")[0] in PACKAGES]
     assert not bare, f"{name} imports {bare}: write nocl.{bare[0]}"
-
-
-@pytest.mark.parametrize("name", [n for n in FILES if layer(n) == "solvers"])
-def test_among_solvers_only_the_chain_imports(name):
-    """lqr <- nmpc <- ddp <- cnd; every other solver stands alone. The package itself hands names on, lazily."""
-    own = solver(name)
-    for target in {solver(t) for t in imports(name, top_level=not own) if layer(t) == "solvers"} - {"", own}:
-        links = [PARTS.get(s, s) for s in (target, own)]
-        if links[0] == links[1]:
-            continue
-        assert set(links) <= set(CHAIN), f"{name} imports the solver {target}, outside the chain {' <- '.join(CHAIN)}"
-        assert CHAIN.index(links[0]) <= CHAIN.index(links[1]), f"{name} imports {target}, a later link of the chain"
-
-
-def test_there_is_no_cycle():
-    """Depth first over what importing a module imports; `import nocl` alone counts as its __init__."""
-    state: dict[str, str] = {}
-
-    def visit(name: str, path: list[str]) -> None:
-        if state.get(name) == "done":
-            return
-        assert state.get(name) != "open", " -> ".join([*path, name])
-        state[name] = "open"
-        for target in imports(name, top_level=True):
-            if target in FILES and target != name:
-                visit(target, [*path, name])
-        state[name] = "done"
-
-    for name in FILES:
-        visit(name, [])
 
 
 @pytest.mark.parametrize("statement", ["import nocl", "import nocl; nocl.load_ocp('cartpole')"])

@@ -13,8 +13,8 @@ from nocl.cli.commands import main
 from nocl.solvers.ddp.solver import DDP
 from nocl.sysid.identification import LearnedDynamics, LogSettings, identify
 from nocl.sysid.logs.coverage import Coverage
+from nocl.sysid.logs.derivatives import dataset, noise
 from nocl.sysid.logs.log import Log
-from nocl.sysid.logs.smoothing import dataset, noise
 from nocl.sysid.logs.validation import validate
 from nocl.systems import cartpole, pendulum
 

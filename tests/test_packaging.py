@@ -21,7 +21,7 @@ import sys
 sys.modules["l4casadi"] = None  # not installed
 import casadi as ca
 import nocl
-from nocl import store
+from nocl import records
 from nocl.nets import MLP, FeatureNet
 
 assert nocl.__file__.startswith(sys.argv[1]), nocl.__file__
@@ -31,8 +31,8 @@ assert sys.modules[type(ocp).__module__].__file__.startswith(sys.argv[1])
 x, t, y = ca.SX.sym("x", s.nx), ca.SX.sym("t"), ca.SX.sym("y", s.nu)
 net = FeatureNet(ca.Function("i", [x, t], [ca.vertcat(x, t)], ["x", "t"], ["phi"]), [MLP([s.nx + 1, 4, s.nu])],
                  ca.Function("o", [x, t, y], [y], ["x", "t", "y"], ["u"])).double()
-store.save_net("run", "controller", net)
-policy = nocl.to_casadi(store.load_net("run", "controller"), name="policy")
+records.save_net("run", "controller", net)
+policy = nocl.to_casadi(records.load_net("run", "controller"), name="policy")
 print(policy, s.f(ocp.x_goal, policy(ocp.x_goal, 0)))
 try:
     nocl.to_casadi(net, backend="l4casadi")

@@ -32,7 +32,10 @@ from nocl.comparisons.report.findings import (
     ValueAudit,
 )
 from nocl.comparisons.report.page import script_json
-from nocl.comparisons.report.results import Judged, Report
+from nocl.comparisons.report.report import Report
+from nocl.comparisons.report.results import (
+    Judged,
+)
 from nocl.comparisons.report.tables import Table, tables
 from nocl.judge import Simulation
 from nocl.solvers import LQR

@@ -74,9 +74,9 @@ class Off:
     def __init__(self, shift: float, only: str) -> None:
         self.shift, self.only, self.ocp = shift, only, CONTROLLER.ocp
 
-    def parts(self) -> list[parity.Part]:
+    def export_parts(self) -> list[parity.Part]:
         return [dataclasses.replace(p, torch=lambda x, t, p=p: p.torch(x, t) + self.shift * x[:, :1] ** 2)
-                if p.name == self.only else p for p in CONTROLLER.parts()]
+                if p.name == self.only else p for p in CONTROLLER.export_parts()]
 
 
 @pytest.mark.parametrize("only", ["policy", "value_gradient"])
@@ -96,14 +96,14 @@ def test_a_failed_export_leaves_a_former_one_as_it_was(exported, tmp_path):
 
 
 def test_nan_is_no_parity():
-    part = CONTROLLER.parts()[0]
+    part = CONTROLLER.export_parts()[0]
     z = parity.samples(part)
     found = parity.findings(part, "broken", "float32", z, lambda z: np.full((len(z), 1), np.nan))
     assert not found[0].ok
 
 
 def test_samples_hold_the_corners_of_the_box():
-    part = CONTROLLER.parts()[0]
+    part = CONTROLLER.export_parts()[0]
     z = parity.samples(part, n=10)
     s = CONTROLLER.ocp.system
     lower, upper = np.r_[s.lbx, 0], np.r_[s.ubx, 4]

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from nocl import records
 from nocl.nets import MLP, FeatureNet
 from nocl.support import store
 
@@ -26,8 +27,8 @@ def network(dtype: torch.dtype = torch.float64, skip: bool = True) -> FeatureNet
 def test_a_network_comes_back_bit_by_bit(tmp_path, dtype):
     net = network(dtype)
     rng = torch.get_rng_state()
-    path = store.save_net(tmp_path / "new", "controller", net)
-    again = store.load_net(tmp_path / "new", "controller")
+    path = records.save_net(tmp_path / "new", "controller", net)
+    again = records.load_net(tmp_path / "new", "controller")
     assert torch.equal(rng, torch.get_rng_state())  # loading draws nothing
     assert [p.name for p in path.parent.iterdir()] == ["controller.safetensors"]
     expected, got = net.state_dict(), again.state_dict()
@@ -42,11 +43,11 @@ def test_a_network_comes_back_bit_by_bit(tmp_path, dtype):
 
 def test_several_records_share_a_folder_and_the_last_save_counts(tmp_path):
     controller, value, other = network(), network(skip=False), network()
-    store.save_net(tmp_path, "controller", controller)
-    store.save_net(tmp_path, "value", value)
-    store.save_net(tmp_path, "controller", other)
-    assert torch.equal(store.load_net(tmp_path, "controller").nets[0].body[0].weight, other.nets[0].body[0].weight)
-    assert store.load_net(tmp_path, "value").nets[0].skip is None
+    records.save_net(tmp_path, "controller", controller)
+    records.save_net(tmp_path, "value", value)
+    records.save_net(tmp_path, "controller", other)
+    assert torch.equal(records.load_net(tmp_path, "controller").nets[0].body[0].weight, other.nets[0].body[0].weight)
+    assert records.load_net(tmp_path, "value").nets[0].skip is None
     assert sorted(p.name for p in tmp_path.iterdir()) == ["controller.safetensors", "value.safetensors"]
 
 
@@ -54,8 +55,8 @@ def test_a_record_holds_networks_functions_and_a_card(tmp_path):
     x = ca.SX.sym("x", 2)
     f = ca.Function("f", [x], [x / 3 + ca.sin(x[0])], ["x"], ["xdot"])
     nets = {"a": network(), "b": network()}
-    store.save(tmp_path, "cnd", nets=nets, functions={"f": f}, card={"seed": 3, "names": ["x"]})
-    record = store.load(tmp_path, "cnd")
+    records.save(tmp_path, "cnd", nets=nets, functions={"f": f}, card={"seed": 3, "names": ["x"]})
+    record = records.load(tmp_path, "cnd")
     assert set(record.nets) == {"a", "b"}
     assert record.card == {"seed": 3, "names": ["x"]}
     assert np.array_equal(record.functions["f"]([0.1, 0.7]).full(), f([0.1, 0.7]).full())
@@ -74,48 +75,48 @@ def broken(good: bytes) -> dict[str, bytes]:
 
 
 def test_broken_files_are_refused_by_name(tmp_path):
-    path = store.save_net(tmp_path, "net", network())
+    path = records.save_net(tmp_path, "net", network())
     good = path.read_bytes()
     for what, content in broken(good).items():
         path.write_bytes(content)
         with pytest.raises(ValueError, match=str(path)):
-            pytest.fail(f"{what}: loaded {store.load_net(tmp_path, 'net')}")
+            pytest.fail(f"{what}: loaded {records.load_net(tmp_path, 'net')}")
     path.write_bytes(good)
-    store.load_net(tmp_path, "net")
+    records.load_net(tmp_path, "net")
 
 
 def test_missing_and_foreign_files_are_refused(tmp_path):
     with pytest.raises(ValueError, match="is not a folder"):
-        store.load_net(tmp_path / "nowhere", "net")
-    path = store.save_net(tmp_path, "value", network())
+        records.load_net(tmp_path / "nowhere", "net")
+    path = records.save_net(tmp_path, "value", network())
     with pytest.raises(ValueError, match=r"no controller\.safetensors \(records there: value"):
-        store.load_net(tmp_path, "controller")
+        records.load_net(tmp_path, "controller")
     path.rename(tmp_path / "controller.safetensors")
     with pytest.raises(ValueError, match="is a 'value' of nocl's; expected a 'controller'"):
-        store.load_net(tmp_path, "controller")
+        records.load_net(tmp_path, "controller")
     store.save_checkpoint(tmp_path / "state", {"a": 1})
     with pytest.raises(ValueError, match="expected letters"):
-        store.save_net(tmp_path, "../net", network())
+        records.save_net(tmp_path, "../net", network())
     with pytest.raises(ValueError, match="expected a checkpoint"):
         store.load_checkpoint(tmp_path / "none")
-    store.save(tmp_path, "pair", nets={"a": network(), "b": network()})
+    records.save(tmp_path, "pair", nets={"a": network(), "b": network()})
     with pytest.raises(ValueError, match="expected one network"):
-        store.load_net(tmp_path, "pair")
+        records.load_net(tmp_path, "pair")
 
 
 def test_wrong_tensor_shapes_are_refused(tmp_path):
     net = network()
     net.nets[0].sizes = (3, 9, 1)  # a structure that the weights do not fit
-    store.save_net(tmp_path, "net", net)
+    records.save_net(tmp_path, "net", net)
     with pytest.raises(ValueError, match=r"nets\.0\.body\.0\.bias has shape \(8,\), expected \(9,\)"):
-        store.load_net(tmp_path, "net")
+        records.load_net(tmp_path, "net")
 
 
 def test_only_data_is_stored(tmp_path):
     with pytest.raises(ValueError, match="expected a nocl"):
-        store.save_net(tmp_path, "net", torch.nn.Linear(1, 1))
+        records.save_net(tmp_path, "net", torch.nn.Linear(1, 1))
     with pytest.raises(ValueError, match="expected plain data"):
-        store.save(tmp_path, "cnd", nets={}, card={"a": object()})
+        records.save(tmp_path, "cnd", nets={}, card={"a": object()})
     with pytest.raises(ValueError, match=r"state\.a is a object"):
         store.save_checkpoint(tmp_path / "c", {"a": object()})
     assert not list(tmp_path.iterdir())

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from nocl.comparisons.report.drawings import Draw, drawing, is_spatial
 from nocl.comparisons.report.explain import worst_states
-from nocl.comparisons.report.results import REFERENCE, Report, number
+from nocl.comparisons.report.results import REFERENCE, Results, number
 from nocl.comparisons.report.style import COLOURS, STYLE, plain
 from nocl.support.checks import Array
 
@@ -24,7 +24,7 @@ DPI = 90
 PALETTE = 64  # colours
 
 
-def animate(report: Report, state: int | None = None, methods: Sequence[str] | None = None, draw: Draw | None = None,
+def animate(report: Results, state: int | None = None, methods: Sequence[str] | None = None, draw: Draw | None = None,
             seconds: float = 4.0) -> bytes:
     """The GIF's bytes.
 
@@ -45,18 +45,18 @@ def animate(report: Report, state: int | None = None, methods: Sequence[str] | N
     return _gif(images)
 
 
-def can_animate(report: Report) -> bool:
+def can_animate(report: Results) -> bool:
     """Whether there is a state that the shown methods all ran from."""
     return any(_shown(report, _chosen(report, None)))
 
 
-def _shown(report: Report, chosen: Sequence[int]) -> list[bool]:
+def _shown(report: Results, chosen: Sequence[int]) -> list[bool]:
     """[B], whether every chosen method has a run from a state."""
     runs = [np.isfinite(report.judged[m].simulation.x).all(axis=(1, 2)) for m in chosen]
     return np.all(runs, axis=0).tolist()
 
 
-def _chosen(report: Report, methods: Sequence[str] | None) -> list[int]:
+def _chosen(report: Results, methods: Sequence[str] | None) -> list[int]:
     names = [j.name for j in report.judged]
     if methods is None:
         own = [m for m, name in enumerate(names) if name != REFERENCE] or list(range(len(names)))
@@ -67,7 +67,7 @@ def _chosen(report: Report, methods: Sequence[str] | None) -> list[int]:
     return [names.index(name) for name in methods]
 
 
-def _state(report: Report, state: int | None, chosen: Sequence[int]) -> int:
+def _state(report: Results, state: int | None, chosen: Sequence[int]) -> int:
     """The state that is shown."""
     B = len(report.x0)
     if state is not None and not 0 <= state < B:
@@ -83,7 +83,7 @@ def _state(report: Report, state: int | None, chosen: Sequence[int]) -> int:
     return able[len(able) // 2]
 
 
-def _set_up(report: Report, i: int, chosen: Sequence[int], draw: Draw) -> tuple[Figure, Callable[[float], list[Any]]]:
+def _set_up(report: Results, i: int, chosen: Sequence[int], draw: Draw) -> tuple[Figure, Callable[[float], list[Any]]]:
     ocp, n = report.ocp, len(chosen)
     figure = Figure(figsize=(4.1 * n, 4.6), dpi=DPI)
     FigureCanvasAgg(figure)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nocl.comparisons.report.results import REFERENCE, Report, count, number, percent
+from nocl.comparisons.report.results import REFERENCE, Results, count, number, percent
 from nocl.support.checks import Array
 
 NEIGHBOURS = 5
@@ -28,18 +28,18 @@ class Explained:
     sentences: list[str]
 
 
-def explained_method(report: Report) -> int:
+def explained_method(report: Results) -> int:
     """The method whose worst states are told: the first that is no reference."""
     return next((m for m, j in enumerate(report.judged) if j.name != REFERENCE), 0)
 
 
-def worst_states(report: Report, m: int | None = None) -> list[int]:
+def worst_states(report: Results, m: int | None = None) -> list[int]:
     """States by the gap of method m (the explained one), the widest first."""
     m = explained_method(report) if m is None else m
     return np.argsort(-report.gap[m], kind="stable").tolist()
 
 
-def worst(report: Report, k: int = 5, m: int | None = None) -> list[Explained]:
+def worst(report: Results, k: int = 5, m: int | None = None) -> list[Explained]:
     """The k states with the widest gap of method m, explained; none where it has the best known cost."""
     m = explained_method(report) if m is None else m
     ways = _Ways(report)
@@ -47,7 +47,7 @@ def worst(report: Report, k: int = 5, m: int | None = None) -> list[Explained]:
             for i in worst_states(report, m)[:k] if report.gap[m, i] > 0]
 
 
-def _sentences(report: Report, ways: _Ways, m: int, i: int) -> Iterator[str]:
+def _sentences(report: Results, ways: _Ways, m: int, i: int) -> Iterator[str]:
     j, s = report.judged[m], report.judged[m].simulation
     b = _best(report, i)
     if not s.success[i]:
@@ -68,12 +68,12 @@ def _sentences(report: Report, ways: _Ways, m: int, i: int) -> Iterator[str]:
         yield from _neighbours(report, ways, m, i)
 
 
-def _best(report: Report, i: int) -> int | None:
+def _best(report: Results, i: int) -> int | None:
     names = [j.name for j in report.judged]
     return names.index(report.best_method[i]) if report.best_method[i] else None
 
 
-def _lost_where(report: Report, m: int, b: int, i: int) -> str:
+def _lost_where(report: Results, m: int, b: int, i: int) -> str:
     """Running or terminal cost, and by which coordinate the goal is missed most."""
     ours, best = report.judged[m].simulation, report.judged[b].simulation
     running = float(ours.running_cost[i] - best.running_cost[i])
@@ -88,7 +88,7 @@ def _lost_where(report: Report, m: int, b: int, i: int) -> str:
     return f"Lost in {where} (running {running:+.3g}, terminal {terminal:+.3g}); {miss}."
 
 
-def _manners(report: Report, m: int, b: int | None, i: int) -> Iterator[str]:
+def _manners(report: Results, m: int, b: int | None, i: int) -> Iterator[str]:
     """Collision and saturation."""
     s = report.judged[m].simulation
     if not report.feasible[m, i]:
@@ -99,7 +99,7 @@ def _manners(report: Report, m: int, b: int | None, i: int) -> Iterator[str]:
         yield f"Its control is at a bound {100 * s.saturation[i]:.0f} % of the time{beside}."
 
 
-def _neighbours(report: Report, ways: _Ways, m: int, i: int) -> Iterator[str]:
+def _neighbours(report: Results, ways: _Ways, m: int, i: int) -> Iterator[str]:
     """Whether the states about it fare the same, and whether their best runs take its best run's way."""
     near = ways.near[i]
     if not len(near):
@@ -121,7 +121,7 @@ def _neighbours(report: Report, ways: _Ways, m: int, i: int) -> Iterator[str]:
 class _Ways:
     """How far apart runs are: at the worst time, in the worst coordinate, in standard deviations over all runs."""
 
-    def __init__(self, report: Report) -> None:
+    def __init__(self, report: Results) -> None:
         self.report = report
         self.t = np.linspace(0.0, report.ocp.horizon, NODES)
         runs = [j.simulation for j in report.judged]

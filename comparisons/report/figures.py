@@ -10,13 +10,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from nocl.comparisons.report.explain import explained_method, worst_states
-from nocl.comparisons.report.results import Report, percent
+from nocl.comparisons.report.results import Results, percent
 from nocl.comparisons.report.study_figures import study_figures
 from nocl.comparisons.report.style import COLOURS, SMALL_GAP, STYLE, look, plain
 from nocl.support.checks import Array
 
 
-def draw(report: Report) -> dict[str, Figure]:
+def draw(report: Results) -> dict[str, Figure]:
     """All figures of a report by name; `costs` only where there are two methods to set side by side."""
     with matplotlib.rc_context(STYLE):
         figures = {"gaps": gaps(report)}
@@ -35,13 +35,13 @@ def draw(report: Report) -> dict[str, Figure]:
 NAMES = ("gaps", "costs", "map", "value", "timings", "robustness", "stability", "regions", "trajectories", "worst")
 
 
-def typical_states(report: Report) -> list[int]:
+def typical_states(report: Results) -> list[int]:
     """Where the explained method's gap is the least, at its median, and the widest."""
     order = worst_states(report)
     return list(dict.fromkeys([order[-1], order[len(order) // 2], order[0]]))
 
 
-def gaps(report: Report) -> Figure:
+def gaps(report: Results) -> Figure:
     """Share of initial states within a gap; a method's line ends below 100 % where it failed."""
     figure = Figure(figsize=(7, 3.6), layout="constrained")
     ax = figure.subplots()
@@ -62,7 +62,7 @@ def gaps(report: Report) -> Figure:
     return figure
 
 
-def costs(report: Report) -> Figure:
+def costs(report: Results) -> Figure:
     """Cost of each state, one method against the reference: the last one named."""
     figure = Figure(figsize=(4.8, 4.4), layout="constrained")
     ax = figure.subplots()
@@ -83,7 +83,7 @@ def costs(report: Report) -> Figure:
     return figure
 
 
-def trajectories(report: Report, states: Sequence[int]) -> Figure:
+def trajectories(report: Results, states: Sequence[int]) -> Figure:
     """States and controls over time; a column for each initial state, a line for each method."""
     s = report.ocp.system
     names = [plain(s.unit(name)) for name in s.names]
@@ -108,7 +108,7 @@ def trajectories(report: Report, states: Sequence[int]) -> Figure:
     return figure
 
 
-def _gap_title(report: Report, i: int) -> str:
+def _gap_title(report: Results, i: int) -> str:
     m = explained_method(report)
     gap, name = report.gap[m, i], plain(report.judged[m].name)
     return f"{name} +{percent(max(gap, 0.0))} %" if np.isfinite(gap) else f"{name} failed"

@@ -20,17 +20,18 @@ from nocl.comparisons.report.animate import animate, can_animate
 from nocl.comparisons.report.drawings import Draw
 from nocl.comparisons.report.explain import worst
 from nocl.comparisons.report.page import page
-from nocl.comparisons.report.results import Report, csv_text, flat_rows
+from nocl.comparisons.report.results import Results, csv_text, flat_rows
 from nocl.comparisons.report.style import encode
 from nocl.comparisons.report.tables import NAMES as TABLES
 from nocl.comparisons.report.tables import Table, tables
+from nocl.comparisons.report.verdict import verdict
 from nocl.support import store
 
 PACKAGES = ("nocl", "casadi", "numpy", "scipy", "torch", "matplotlib")
 ANIMATED = 200  # initial states above which a report has no animation unless asked
 
 
-def write_report(report: Report, folder: Path, animation: bool | None = None, draw: Draw | None = None) -> Path:
+def write_report(report: Results, folder: Path, animation: bool | None = None, draw: Draw | None = None) -> Path:
     """Write all files into the folder, each atomically; everything is made before the first is written.
 
     animation: whether to make animation.gif; None: up to ANIMATED states, where there is a run to show.
@@ -61,9 +62,9 @@ def _names() -> list[str]:
             *(f"tables/{name}.{form}" for name in TABLES for form in ("csv", "tex"))]
 
 
-def markdown(report: Report, run: dict[str, Any], found: dict[str, Table]) -> str:
+def markdown(report: Results, run: dict[str, Any], found: dict[str, Table]) -> str:
     """summary.md: the verdict, the tables, the worst states, what was run."""
-    parts = [f"# {report.ocp.system.name}: {', '.join(j.name for j in report.judged)}", *report.verdict()]
+    parts = [f"# {report.ocp.system.name}: {', '.join(j.name for j in report.judged)}", *verdict(report)]
     for name, table in found.items():
         parts += [f"## {table.title}", table.markdown()]
         if name == "worst":
@@ -76,9 +77,9 @@ def markdown(report: Report, run: dict[str, Any], found: dict[str, Table]) -> st
     return "\n\n".join(parts) + "\n"
 
 
-def summary_data(report: Report) -> dict[str, Any]:
+def summary_data(report: Results) -> dict[str, Any]:
     """Verdict, summary and what a study found, without arrays over the states, as plain data."""
-    return {"verdict": report.verdict(), "summary": list(report.summary()),
+    return {"verdict": verdict(report), "summary": list(report.summary()),
             "audits": [audit.summary() for audit in report.audits],
             "robustness": [] if report.robustness is None else report.robustness.summary(),
             "promises": [vars(promise) | {"text": str(promise)} for promise in report.promises],
@@ -91,7 +92,7 @@ def _check_folder(folder: Path) -> None:
             raise ValueError(f"{path} is a file; expected a folder to write the report to: name another one")
 
 
-def what_was_run(report: Report) -> dict[str, Any]:
+def what_was_run(report: Results) -> dict[str, Any]:
     """Versions, machine, settings and equations: what it takes to run it again."""
     return {"settings": dict(report.settings), "seconds": round(report.seconds, 3),
             "commit": _commit(), "made": datetime.now(UTC).isoformat(timespec="seconds"), "versions": _versions(),

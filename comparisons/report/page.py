@@ -13,13 +13,14 @@ from typing import Any
 
 from nocl.comparisons.report.explain import explained_method, worst
 from nocl.comparisons.report.payload import payload, valued
-from nocl.comparisons.report.results import REFERENCE, Report, count, percent
+from nocl.comparisons.report.results import REFERENCE, Results, count, percent
 from nocl.comparisons.report.tables import Table, facts, tables, x0_text
+from nocl.comparisons.report.verdict import verdict
 
 SAID_FIRST = 3  # sentences of the verdict that stand above the table
 
 
-def page(report: Report, pictures: Mapping[str, Mapping[str, bytes]], run: Mapping[str, Any]) -> str:
+def page(report: Results, pictures: Mapping[str, Mapping[str, bytes]], run: Mapping[str, Any]) -> str:
     """The whole page; `pictures` by name and form ("svg", "png") are what is printed, or shown without JavaScript."""
     title = f"{report.ocp.system.name}: {', '.join(j.name for j in report.judged)}"
     sections = list(_sections(report, pictures, run))
@@ -55,7 +56,7 @@ def _finite(data: Any) -> Any:
     return None if isinstance(data, float) and (data != data or abs(data) == float("inf")) else data
 
 
-def _what(report: Report) -> str:
+def _what(report: Results) -> str:
     how = str(report.settings.get("initial states", ""))
     return f"{count(len(report.x0), 'initial state')} {how}, {count(len(report.judged), 'method')}."
 
@@ -63,7 +64,8 @@ def _what(report: Report) -> str:
 Section = tuple[str, str, str]  # its anchor, its heading, its content
 
 
-def _sections(report: Report, pictures: Mapping[str, Mapping[str, bytes]], run: Mapping[str, Any]) -> Iterator[Section]:
+def _sections(report: Results, pictures: Mapping[str, Mapping[str, bytes]],
+              run: Mapping[str, Any]) -> Iterator[Section]:
     """In the order of reading: the verdict first."""
     made, image = tables(report), functools.partial(_static, pictures)
     yield "verdict", "Verdict", _verdict(report, made["summary"])
@@ -94,8 +96,8 @@ def _sections(report: Report, pictures: Mapping[str, Mapping[str, bytes]], run: 
     yield "run", "What was run", _run(report, run)
 
 
-def _verdict(report: Report, table: Table) -> str:
-    said = report.verdict()
+def _verdict(report: Results, table: Table) -> str:
+    said = verdict(report)
     first, more = said[:SAID_FIRST], said[SAID_FIRST:]
     return ("".join(f"<p class=verdict>{escape(s)}</p>" for s in first) + table.html()
             + "".join(f"<p>{escape(s)}</p>" for s in more))
@@ -115,15 +117,15 @@ def _static(pictures: Mapping[str, Mapping[str, bytes]], name: str) -> str:
     return f'<img class=static alt="{escape(name)}" src="{source}">'
 
 
-def _costs(report: Report, image: Any) -> str:
+def _costs(report: Results, image: Any) -> str:
     return "" if len(report.judged) < 2 else _plot("costs", COSTS) + str(image("costs"))
 
 
-def _worst_heading(report: Report) -> str:
+def _worst_heading(report: Results) -> str:
     return f"The worst states of {report.judged[explained_method(report)].name}, explained"
 
 
-def _worst(report: Report) -> str:
+def _worst(report: Results) -> str:
     """A card for each state; its button shows the state in the explorer."""
     cards, explained = [], worst(report)
     if not explained:
@@ -138,7 +140,7 @@ def _worst(report: Report) -> str:
     return "<div class=cards>" + "".join(cards) + "</div>"
 
 
-def _run(report: Report, run: Mapping[str, Any]) -> str:
+def _run(report: Results, run: Mapping[str, Any]) -> str:
     pairs = [(key, value) for part in ("settings", "versions", "machine") for key, value in run[part].items()
              if value is not None]
     pairs += [(key, run[key]) for key in ("commit", "made") if run.get(key)]

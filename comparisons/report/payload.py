@@ -1,4 +1,4 @@
-"""What the page draws from: a Report as compact plain data, arrays in base64. B is the batch, M the methods.
+"""What the page draws from: a Results as compact plain data, arrays in base64. B is the batch, M the methods.
 
 Runs are the bulk. Each (state, channel) of a method is kept at some times as 16-bit steps between its least and its
 greatest value, an error of at most 1 / 131068 of that range: far below a pixel. The page decodes them at a click.
@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from nocl.comparisons.report.explain import explained_method
 from nocl.comparisons.report.findings import MethodAudit, Rollouts
-from nocl.comparisons.report.results import Judged, Report
+from nocl.comparisons.report.results import Judged, Results
 from nocl.comparisons.report.tables import AUDITED
 from nocl.ocp import OCP
 from nocl.support.checks import Array
@@ -33,7 +33,7 @@ OUTLINE = 121  # points of the grid that an obstacle's edge is found on, in each
 MARGIN = 0.15  # of what runs visit, about a slice
 
 
-def payload(report: Report) -> dict[str, Any]:
+def payload(report: Results) -> dict[str, Any]:
     """All that the page's figures need, as JSON data."""
     s, kept = report.ocp.system, kept_states(report)
     nodes, states = kept
@@ -54,7 +54,7 @@ def floats(values: ArrayLike) -> str:
     return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode()
 
 
-def kept_states(report: Report) -> tuple[int, NDArray[np.integer[Any]]]:
+def kept_states(report: Results) -> tuple[int, NDArray[np.integer[Any]]]:
     """(nodes, states) whose runs fit into the page: all states if they can, else the worst and an even choice."""
     channels = _channels(report)
     size = len(report.judged) * channels * 2 * 4 / 3  # characters of one state at one node
@@ -67,23 +67,23 @@ def kept_states(report: Report) -> tuple[int, NDArray[np.integer[Any]]]:
     return nodes, np.unique(np.r_[order[: n // 4], order[even]])
 
 
-def _channels(report: Report) -> int:
+def _channels(report: Results) -> int:
     """States, controls, cost to go, and V along the run where a method has one."""
     return report.ocp.system.nx + report.ocp.system.nu + 1 + (valued(report) is not None)
 
 
-def valued(report: Report) -> Judged | None:
+def valued(report: Results) -> Judged | None:
     """The first method with a value function."""
     return next((j for j in report.judged if j.value is not None), None)
 
 
-def _index(report: Report, i: int) -> int:
+def _index(report: Results, i: int) -> int:
     """Who found the best known cost, -1 where nobody did."""
     names = [j.name for j in report.judged]
     return names.index(report.best_method[i]) if report.best_method[i] else -1
 
 
-def _method(report: Report, j: Judged, nodes: int, states: NDArray[np.integer[Any]]) -> dict[str, Any]:
+def _method(report: Results, j: Judged, nodes: int, states: NDArray[np.integer[Any]]) -> dict[str, Any]:
     s = j.simulation
     index = np.unique(np.rint(np.linspace(0, len(s.t) - 1, min(nodes, len(s.t)))).astype(int))
     channels = [s.x[states], s.u[states], cost_to_go(report.ocp, j)[states, :, None]]
@@ -143,7 +143,7 @@ def _values(owner: Judged, x: Array, t: float) -> Array:
     return V
 
 
-def plane(report: Report) -> list[int]:
+def plane(report: Results) -> list[int]:
     """The two coordinates (of states, then controls) of a phase portrait: an obstacle's, or a state and its rate."""
     for pair in _obstacle_pairs(report.ocp):
         return list(pair)
@@ -156,7 +156,7 @@ def plane(report: Report) -> list[int]:
     return list(best) if best else sorted(np.argsort(-moved, kind="stable")[:2].tolist())
 
 
-def _moved(report: Report) -> Array:
+def _moved(report: Results) -> Array:
     """[nx], what each coordinate moves by along the runs, as a share of its box."""
     spans = []
     for j in report.judged:
@@ -167,7 +167,7 @@ def _moved(report: Report) -> Array:
     return np.max(spans, axis=0) / (s.ubx - s.lbx) if spans else np.zeros(s.nx)
 
 
-def visited(report: Report) -> tuple[Array, Array]:
+def visited(report: Results) -> tuple[Array, Array]:
     """(lower, upper) [nx] of the states that runs visit, without the outermost hundredths."""
     x = np.concatenate([j.simulation.x.reshape(-1, report.ocp.system.nx) for j in report.judged])
     x = x[np.isfinite(x).all(axis=1)]
@@ -188,7 +188,7 @@ def _obstacle_pairs(ocp: OCP) -> dict[tuple[int, int], list[int]]:
     return pairs
 
 
-def obstacles(report: Report) -> list[dict[str, Any]]:
+def obstacles(report: Results) -> list[dict[str, Any]]:
     """The edges of path constraints that depend on two coordinates: min h on a grid of them."""
     low, high = visited(report)
     found = []
@@ -200,7 +200,7 @@ def obstacles(report: Report) -> list[dict[str, Any]]:
     return found
 
 
-def slices(report: Report) -> dict[str, Any] | None:
+def slices(report: Results) -> dict[str, Any] | None:
     """V over pairs of coordinates at some times, the others as in the median run; None without a value function."""
     owner = valued(report)
     if owner is None:
@@ -231,7 +231,7 @@ def _slice(owner: Judged, base: Array, pair: tuple[int, ...], low: Array, high: 
     return _values(owner, x, t).reshape(GRID, GRID)
 
 
-def _rollout_nodes(report: Report) -> int:
+def _rollout_nodes(report: Results) -> int:
     """Times that the audits' rollouts are kept at: all of them fit, or 0."""
     runs = sum(len(audit.rollouts) for audit in report.audits) * len(report.x0)
     fits = (nodes for nodes in NODES if runs * (nodes + 4) * report.ocp.system.nx * 2 * 4 / 3 <= ROLLOUTS)
@@ -252,7 +252,7 @@ def _audit(audit: MethodAudit, nodes: int) -> dict[str, Any]:
             "rollouts": [_rollout(rollout, nodes) for rollout in audit.rollouts] if nodes else []}
 
 
-def _study(report: Report) -> dict[str, Any]:
+def _study(report: Results) -> dict[str, Any]:
     """What a study found beyond costs, where it did."""
     parts: list[tuple[str, Callable[[], Any]]] = [
         ("audits", lambda: [_audit(audit, _rollout_nodes(report)) for audit in report.audits]),

@@ -1,15 +1,13 @@
-"""Report: what a comparison found, as rows, a summary, a verdict and files. Gaps and shares are in per cent."""
+"""What a comparison found, as rows and a summary. Gaps and shares are in per cent."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -75,7 +73,7 @@ class Summary(list[Row]):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Report:
+class Results:
     """Any methods on the same B initial states of a problem; `rows`, `summary` and `verdict` are read from `judged`.
 
     What a study finds beyond costs stands in the other fields, empty where it was not asked for.
@@ -102,12 +100,6 @@ class Report:
     def summary(self) -> Summary:
         """One dict a method. Means are over the runs that did not fail; medians, percentiles and shares over all."""
         return Summary(self._summarize(m) for m in range(len(self.judged)))
-
-    def verdict(self) -> list[str]:
-        """What the numbers say, in a few sentences."""
-        from nocl.comparisons.report.verdict import verdict
-
-        return verdict(self)
 
     @cached_property
     def cost(self) -> Array:
@@ -171,42 +163,6 @@ class Report:
                 "clearance_min": float(np.min(s.clearance[ok], initial=math.inf)),
                 "ms_first": mean(j.ms_first), "solves": mean(j.solves), "ms_per_solve": mean(_each_answer(j)),
                 "ms_per_control": mean(j.ms_per_control)}
-
-    def save(self, folder: str | Path, animation: bool | None = None, draw: Any = None) -> Path:
-        """Write report.html and its companions (files.py lists them) into the folder; return the path of report.html.
-
-        A report that stands there is replaced, file by file and each atomically; other files stay.
-
-        Parameters
-        ----------
-        animation : whether to make animation.gif, of the first two methods side by side; default: up to 200 states
-        draw : how the system is drawn there: see nocl.comparisons.animate
-        """
-        from nocl.comparisons.report.files import write_report  # matplotlib is imported where pictures are drawn
-
-        return write_report(self, Path(folder), animation, draw)
-
-    def __str__(self) -> str:
-        what = f"{self.ocp.system.name}, {count(len(self.x0), 'initial state')} {self.settings['initial states']}"
-        said = [textwrap.fill(sentence, WIDTH, subsequent_indent="  ") for sentence in self.verdict()]
-        promised = [textwrap.fill(str(promise), WIDTH, subsequent_indent="  ") for promise in self.promises]
-        return "\n".join([what, "", str(self.summary()), "", *NOTE, "", *self._disturbed(), *promised, *said])
-
-    def _disturbed(self) -> list[str]:
-        """Medians and 95th percentiles of what disturbances cost, as a table in plain text."""
-        if self.robustness is None:
-            return []
-        scenarios = self.robustness.scenarios
-        body = [[s.name, *(f"{_loss(one.lost, 50)} / {_loss(one.lost, 95)}" for one in s.losses)] for s in scenarios]
-        head = ["cost lost %, median / p95", *(one.method for one in scenarios[0].losses)]
-        return [text_table(head, body), ""]
-
-    __repr__ = __str__
-
-
-def _loss(lost: Array, q: float) -> str:
-    known = lost[~np.isnan(lost)]
-    return percent(percentile(known, q)) if known.size else "-"
 
 
 def _each_answer(judged: Judged) -> Array:
@@ -282,7 +238,7 @@ def count(k: int, what: str) -> str:
     return f"{k} {what}" + ("" if k == 1 else "s")
 
 
-def flat_rows(report: Report) -> list[Row]:
+def flat_rows(report: Results) -> list[Row]:
     """The rows with one column a coordinate: x0 as x0_NAME, x_end as end_NAME, x_end - x* as error_NAME."""
     names = report.ocp.system.state_names
     flat = []

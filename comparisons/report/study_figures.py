@@ -12,20 +12,20 @@ from matplotlib.figure import Figure
 
 from nocl.comparisons.report.explain import explained_method
 from nocl.comparisons.report.payload import slices
-from nocl.comparisons.report.results import Report
+from nocl.comparisons.report.results import Results
 from nocl.comparisons.report.style import COLOURS, SMALL_GAP, look, plain
 from nocl.support.checks import Array
 
 LOSS_FLOOR = 1e-2  # per cent: losses below it are drawn there
 
 
-def study_figures() -> dict[str, Callable[[Report], Figure | None]]:
+def study_figures() -> dict[str, Callable[[Results], Figure | None]]:
     """By name; None where there is nothing to draw."""
     return {"map": gap_map, "value": value_slices, "timings": timings, "robustness": robustness,
             "stability": stability, "regions": regions}
 
 
-def gap_map(report: Report) -> Figure | None:
+def gap_map(report: Results) -> Figure | None:
     """The gap of the explained method over the two coordinates that initial states differ most in."""
     s, sd = report.ocp.system, report.x0.std(axis=0)
     i, k = np.sort(np.argsort(-sd, kind="stable")[:2]) if s.nx > 1 else (0, 0)
@@ -45,7 +45,7 @@ def gap_map(report: Report) -> Figure | None:
     return figure
 
 
-def value_slices(report: Report) -> Figure | None:
+def value_slices(report: Results) -> Figure | None:
     """V over its first pair of coordinates at three times, with runs on top."""
     data = slices(report)
     if data is None:
@@ -75,7 +75,7 @@ def value_slices(report: Report) -> Figure | None:
     return figure
 
 
-def timings(report: Report) -> Figure | None:
+def timings(report: Results) -> Figure | None:
     """Milliseconds of the first answer and of each later control."""
     rows = [(f"{plain(j.name)}, {what}", values[np.isfinite(values) & (values > 0)], m)
             for m, j in enumerate(report.judged)
@@ -99,7 +99,7 @@ def _boxes(ax: Any, rows: list[tuple[str, Array, int]], vertical: bool) -> None:
         median.set_color("black")
 
 
-def robustness(report: Report) -> Figure | None:
+def robustness(report: Results) -> Figure | None:
     """Cost lost in each scenario, a box for each method."""
     if report.robustness is None:
         return None
@@ -121,7 +121,7 @@ def robustness(report: Report) -> Figure | None:
     return figure
 
 
-def stability(report: Report) -> Figure | None:
+def stability(report: Results) -> Figure | None:
     """Eigenvalues in the complex plane."""
     if not report.stability:
         return None
@@ -136,7 +136,7 @@ def stability(report: Report) -> Figure | None:
     return figure
 
 
-def regions(report: Report) -> Figure | None:
+def regions(report: Results) -> Figure | None:
     """Share of successes against the scale of the spread, with bounds."""
     if not report.regions:
         return None

@@ -13,7 +13,7 @@ import numpy as np
 
 from nocl.comparisons.report.explain import worst_states
 from nocl.comparisons.report.findings import quantiles
-from nocl.comparisons.report.results import COLUMNS, NOTE, Report, cells, number, percent
+from nocl.comparisons.report.results import COLUMNS, NOTE, Results, cells, number, percent
 from nocl.support.checks import Array
 
 WORST = 5
@@ -68,9 +68,9 @@ def _latex(text: str) -> str:
     return "".join(_LATEX.get(c, c) for c in text)
 
 
-def tables(report: Report) -> dict[str, Table]:
+def tables(report: Results) -> dict[str, Table]:
     """All tables by the name of their file; those of a study where it was made."""
-    made: dict[str, Callable[[Report], Table]] = {
+    made: dict[str, Callable[[Results], Table]] = {
         "summary": summary, "errors": errors, "worst": worst, "timings": timings, "audits": audits,
         "robustness": robustness, "promises": promises, "stability": stability, "regions": regions,
         "failures": failures}
@@ -82,12 +82,12 @@ NAMES = ("summary", "errors", "worst", "timings", "audits", "robustness", "promi
          "failures")  # the names that `tables` may use
 
 
-def summary(report: Report) -> Table:
+def summary(report: Results) -> Table:
     return Table("Summary", [label for label, _, _ in COLUMNS], [cells(row) for row in report.summary()],
                  " ".join(NOTE))
 
 
-def errors(report: Report) -> Table:
+def errors(report: Results) -> Table:
     """By coordinate, in its unit."""
     s = report.ocp.system
     body = []
@@ -99,7 +99,7 @@ def errors(report: Report) -> Table:
                  "|x(T) - x*| by coordinate: median, largest; over the runs that did not fail.")
 
 
-def worst(report: Report) -> Table:
+def worst(report: Results) -> Table:
     head = ["state", "x0", *(f"{j.name}: cost (gap)" for j in report.judged), "best known by"]
     body = []
     for i in worst_states(report)[:WORST]:
@@ -108,14 +108,14 @@ def worst(report: Report) -> Table:
     return Table("The worst initial states", head, body, text=True)
 
 
-def x0_text(report: Report, i: int) -> str:
+def x0_text(report: Results, i: int) -> str:
     """Like 'p 0.1, v -0.2', without the coordinates that are the same in all states."""
     moves = (report.x0 != report.x0[0]).any(axis=0) | (len(report.x0) == 1)
     named = zip(report.ocp.system.state_names, report.x0[i], moves, strict=True)
     return ", ".join(f"{name} {number(v)}" for name, v, moved in named if moved)
 
 
-def run_cell(report: Report, m: int, i: int) -> str:
+def run_cell(report: Results, m: int, i: int) -> str:
     s = report.judged[m].simulation
     if not s.success[i]:
         return f"failed: {s.message[i]}"
@@ -124,7 +124,7 @@ def run_cell(report: Report, m: int, i: int) -> str:
     return f"{number(report.cost[m, i])} ({percent(report.gap[m, i])} %)"
 
 
-def timings(report: Report) -> Table:
+def timings(report: Results) -> Table:
     head = ["method", "first answer: median", "p95 [ms]", "each later control: median", "p95 [ms]", "solves a state",
             "evaluations of f: median"]
     body = [[j.name, *_median_p95(j.ms_first), *_median_p95(j.ms_per_control), number(float(np.mean(j.solves))),
@@ -149,7 +149,7 @@ AUDITED = (("exploitation", "exploitation %"), ("discretisation", "discretisatio
            ("hamiltonian_gradient", "mean ||dH/du||"), ("doubt", "model doubtful % of nodes"))
 
 
-def audits(report: Report) -> Table:
+def audits(report: Results) -> Table:
     """Median and 95th percentile of each number of an audit that a method has."""
     found = [audit.summary() for audit in report.audits]
     shown = [(key, label) for key, label in AUDITED if any(row.get(key) for row in found)]
@@ -164,7 +164,7 @@ def _spread(found: dict[str, float]) -> str:
     return f"{number(found['p50'])} ({number(found['p95'])})" if found else "-"
 
 
-def robustness(report: Report) -> Table:
+def robustness(report: Results) -> Table:
     rows = [] if report.robustness is None else report.robustness.summary()
     body = [[row["scenario"], row["method"], row["how"], str(row["failures"]),
              *(percent(row["lost"].get(q, math.nan)) for q in ("p5", "p50", "p95"))] for row in rows]
@@ -172,7 +172,7 @@ def robustness(report: Report) -> Table:
                  "Lost: against the optimum solved anew under the same disturbance. A failure counts as infinite.")
 
 
-def promises(report: Report) -> Table:
+def promises(report: Results) -> Table:
     body = [[p.method, f"{p.within:g} %", f"{p.successes} of {p.n}", f"{100 * p.confidence:g} %",
              f"{math.floor(1000 * p.share) / 10:g} %"] for p in report.promises]
     return Table("What can be promised", ["method", "within", "seen", "confidence", "at least"], body,
@@ -180,7 +180,7 @@ def promises(report: Report) -> Table:
                  "that end within so much of the best known cost.")
 
 
-def stability(report: Report) -> Table:
+def stability(report: Results) -> Table:
     body = [[s.method, s.where, number(s.t), number(s.abscissa), number(float(np.median(s.growth))),
              number(float(s.growth.max()))] for s in report.stability]
     return Table("Local stability", ["method", "where", "t", "largest real part", "growth to T: median", "largest"],
@@ -188,14 +188,14 @@ def stability(report: Report) -> Table:
                  "horizon, which is exact: for a policy of a finite horizon eigenvalues alone prove nothing.")
 
 
-def regions(report: Report) -> Table:
+def regions(report: Results) -> Table:
     body = [[r.method, f"{scale:g}", f"{k} of {r.n}", f"{100 * low:.1f} % to {100 * high:.1f} %"]
             for r in report.regions for scale, k, low, high in zip(r.scale, r.successes, r.lower, r.upper, strict=True)]
     return Table("Region of initial states", ["method", "scale of the spread", "succeeded", "share, with its bounds"],
                  body)
 
 
-def failures(report: Report) -> Table:
+def failures(report: Results) -> Table:
     """All failures with their messages."""
     body = [[j.name, str(i), str(j.simulation.message[i])] for j in report.judged for i in range(len(report.x0))
             if not j.simulation.success[i]]

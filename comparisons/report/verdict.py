@@ -12,7 +12,7 @@ from nocl.comparisons.report.results import (
     OPEN_LOOP,
     REFERENCE,
     Judged,
-    Report,
+    Results,
     Row,
     count,
     mean,
@@ -23,7 +23,7 @@ from nocl.comparisons.report.results import (
 UNSTABLE = 0.05  # a plan that costs more than predicted by this share, in the median, is said to lack feedback
 
 
-def verdict(report: Report) -> list[str]:
+def verdict(report: Results) -> list[str]:
     """Who is how near to the best known cost; how fast; what failed."""
     summary = report.summary()
     n = len(report.x0)
@@ -31,7 +31,7 @@ def verdict(report: Report) -> list[str]:
     return [_near(report, summary), *_manners(summary), *open_loop, *_speed(summary), *_failures(summary, n)]
 
 
-def _near(report: Report, summary: Sequence[Row]) -> str:
+def _near(report: Results, summary: Sequence[Row]) -> str:
     """Who is within 5 % of the best known cost; a method with all the answers is the best known by itself."""
     n, answers = len(report.x0), report.feasible.sum(axis=1)
     if np.count_nonzero(answers) == 1:

@@ -173,7 +173,7 @@ def _error(ocp: OCP, x0: Array, V: Any) -> float:
 
 def _shipped(problem: str) -> Any:
     """The controller that comes with nocl, or None."""
-    from nocl.solvers.cnd import pretrained
+    from nocl.solvers.cnd.controller import pretrained
 
     try:
         return pretrained(problem, "exact")

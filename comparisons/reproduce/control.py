@@ -229,7 +229,7 @@ def paper_settings(problem: str, plan: Plan) -> PaperSettings:
 
 
 def _paper(task: Task) -> Made:
-    from nocl.solvers.cnd import train
+    from nocl.solvers.cnd.training import train
 
     settings = paper_settings(task.ocp.system.name, task.plan)
     cnd = train(task.ocp, task.model, method="paper", seed=task.seed, settings=settings, progress=False)
@@ -239,7 +239,8 @@ def _paper(task: Task) -> Made:
 
 
 def _default(task: Task) -> Made:
-    from nocl.solvers.cnd import TrainSettings, train
+    from nocl.solvers.cnd.settings import TrainSettings
+    from nocl.solvers.cnd.training import train
 
     quick = TrainSettings(seeds=6, starts=6, states=40, tails=200, visits=100, rounds=1, iterations=200,
                           value=False, held_out=8)
@@ -255,7 +256,7 @@ def _is_shipped(plan: Plan, name: str, seed: int) -> bool:
 
 def _shipped(task: Task, learned: bool) -> Made:
     """nocl's default as it comes with nocl, made by the same call with seed 0."""
-    from nocl.solvers.cnd import pretrained
+    from nocl.solvers.cnd.controller import pretrained
 
     card = (cnd := pretrained(task.ocp.system.name, "learned" if learned else "exact")).card
     return Made(cnd, "u(x, t) and V, as it ships with nocl", card.get("dynamics_evaluations", math.nan),
@@ -334,7 +335,7 @@ def _key(plan: Plan, problem: str, name: str, seed: int) -> dict[str, Any]:
         settings = asdict(paper_settings(problem, plan))
         key |= {k: list(v) if isinstance(v, tuple) else v for k, v in settings.items()}  # as JSON has them
     if _is_shipped(plan, name, seed):
-        from nocl.solvers.cnd import pretrained
+        from nocl.solvers.cnd.controller import pretrained
 
         cnd = pretrained(problem, "learned" if way.learned else "exact")
         key |= {"controller": fingerprint(cnd.to_casadi()), "seconds": cnd.card["seconds"]}

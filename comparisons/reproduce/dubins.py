@@ -208,7 +208,7 @@ def _level_sets(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Mad
 
 def _pretrained(way: str) -> Callable[..., Made]:
     def made(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
-        from nocl.solvers.cnd import pretrained
+        from nocl.solvers.cnd.controller import pretrained
 
         cnd = pretrained("dubins", SHIPPED[way])
         return cnd, rollout_ms(ocp, cnd, x0), "as it ships with nocl"
@@ -217,8 +217,8 @@ def _pretrained(way: str) -> Callable[..., Made]:
 
 
 def _paper(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
-    from nocl.solvers.cnd import train
     from nocl.solvers.cnd.paper import PaperSettings
+    from nocl.solvers.cnd.training import train
 
     start = time.perf_counter()
     settings = PaperSettings(iterations=plan.paper_iterations, **PAPER)
@@ -258,7 +258,7 @@ def _key(way: str, plan: Plan) -> dict[str, Any]:
     if way == "cnd-paper":
         key |= {"iterations": plan.paper_iterations, **PAPER}
     if way in SHIPPED:
-        from nocl.solvers.cnd import pretrained
+        from nocl.solvers.cnd.controller import pretrained
 
         key["controller"] = fingerprint(pretrained("dubins", SHIPPED[way]).to_casadi())
     return key

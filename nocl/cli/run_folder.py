@@ -22,7 +22,9 @@ import numpy as np
 
 from nocl import __version__
 from nocl.ocp import OCP
-from nocl.solvers.cnd import CND, TrainSettings, train
+from nocl.solvers.cnd.controller import CND
+from nocl.solvers.cnd.settings import TrainSettings
+from nocl.solvers.cnd.training import train
 from nocl.support import store
 from nocl.support.compiler import fingerprint
 from nocl.sysid.identification import LearnedDynamics, LogSettings, Settings, identify
@@ -126,8 +128,8 @@ class Stages:
     def compare(self, cnd: CND, out: Path, methods: Sequence[str], n: int, intervals: int,
                 hold: Sequence[int | None] | None = None, robust: bool = False) -> None:
         """Study the methods on n fresh initial states, save the report and print its summary and verdict."""
-        from nocl.comparisons import study
         from nocl.comparisons.disturbances import mass_variants
+        from nocl.comparisons.studies import study
 
         chosen = {name: cnd if name == "CND" else method(self.ocp, name, intervals) for name in methods}
         model = self._dynamics_there() if cnd.card.get("dynamics") == "learned" else None
@@ -210,18 +212,20 @@ def load_run(folder: Path) -> CND:
 
 def method(ocp: OCP, name: str, intervals: int) -> Any:
     """A method of the comparison other than CND, by name."""
-    from nocl import solvers
     from nocl.solvers.ddp.global_search import GlobalDDP
+    from nocl.solvers.ddp.solver import DDP
+    from nocl.solvers.lqr import LQR
+    from nocl.solvers.nmpc.solver import NMPC
 
     match name.upper():
         case "NMPC":
-            return solvers.NMPC(ocp, intervals=intervals)
+            return NMPC(ocp, intervals=intervals)
         case "NMPC-LOOP":
-            return solvers.NMPC(ocp, intervals=intervals).controller()
+            return NMPC(ocp, intervals=intervals).controller()
         case "DDP":
-            return GlobalDDP(solvers.DDP(ocp, intervals=intervals))
+            return GlobalDDP(DDP(ocp, intervals=intervals))
         case "LQR":
-            return solvers.LQR(ocp)
+            return LQR(ocp)
     raise ValueError(f"method is {name!r}; expected NMPC, NMPC-LOOP, DDP or LQR")
 
 

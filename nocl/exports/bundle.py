@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import os
 import shutil
 import tempfile
@@ -19,7 +18,6 @@ from nocl.exports.casadi_forms import to_casadi
 from nocl.exports.parity import Certificate, Finding, Part
 from nocl.support import store
 from nocl.support.checks import Array
-from nocl.sysid.identification import LearnedDynamics
 from nocl.system import System
 
 FORMS = ("casadi", "l4casadi", "onnx", "c")
@@ -28,7 +26,7 @@ NEEDS = {"l4casadi": ("l4casadi",), "onnx": ("onnx", "onnxruntime")}  # packages
 
 
 def parts_of(thing: Any) -> list[Part]:
-    """The functions of a controller (an object with `parts()`), of learned dynamics or of a list of these.
+    """The functions of a controller or of learned dynamics (objects with `export_parts()`), or of a list of these.
 
     Raises ValueError for others, and for a list with two functions of one name or of different systems.
     """
@@ -39,16 +37,9 @@ def parts_of(thing: Any) -> list[Part]:
             raise ValueError(f"export: got the functions {', '.join(names)} of {', '.join(sorted(systems))}; expected "
                              "different ones of one system: export the others to another folder")
         return parts
-    if hasattr(thing, "parts") and callable(thing.parts):
-        made: list[Part] = thing.parts()
+    if hasattr(thing, "export_parts"):
+        made: list[Part] = thing.export_parts()
         return made
-    if isinstance(thing, LearnedDynamics):
-        s = thing.system
-        box = {"x": (s.lbx, s.ubx), "u": (s.lbu, s.ubu)}
-        labels = {"x": [s.unit(n) for n in s.state_names], "u": [s.unit(n) for n in s.control_names],
-                  "xdot": [f"d {n} / dt" for n in s.state_names]}
-        net = copy.deepcopy(thing.net).double().eval()
-        return [Part("dynamics", thing.to_casadi(), net, box, labels, net)]
     raise ValueError(f"export: got a {type(thing).__name__}; expected a CND, LearnedDynamics or a list of them")
 
 
@@ -97,7 +88,7 @@ def export(thing: Any, folder: str | os.PathLike[str], to: Sequence[str] = ("cas
 
 
 def _system(thing: Any) -> System:
-    found: System = thing.system if isinstance(thing, LearnedDynamics) else thing.ocp.system
+    found: System = thing.system if hasattr(thing, "system") else thing.ocp.system
     return found
 
 

@@ -1,60 +1,28 @@
-"""Systems and problems for other tools: python-control, gymnasium, do-mpc, acados, all optional; Functions taken in."""
+"""Systems and problems for other tools: python-control, gymnasium, do-mpc, acados, all optional."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from nocl.ocp import OCP
 from nocl.support import checks
 from nocl.support.checks import Array
+from nocl.support.packages import package
 from nocl.system import System
 from nocl.translate.rk4 import rk4_cost
 
-if TYPE_CHECKING:
-    from nocl.ocp import OCP
 
-
-def package(name: str, distribution: str | None = None) -> Any:
-    """An optional package; ValueError that says how to install it."""
-    try:
-        return import_module(name)
-    except ImportError as error:
-        what = distribution or "nocl[interop]"
-        raise ValueError(f"{name} cannot be imported ({error}): pip install {what!r}") from None
-
-
-def system_from_casadi(f: ca.Function, *, name: str | None = None, lbu: Any, ubu: Any, lbx: Any, ubx: Any,
-                       states: Sequence[str] | None = None, controls: Sequence[str] | None = None,
-                       **options: Any) -> System:
-    """A System whose equations are those of f:(x [nx], u [nu]) -> xdot [nx].
-
-    f is written out in SX: elementary operations only (ValueError for externals, integrators, look-up tables).
-    states, controls : their names; default x0, x1, ..., u0, ...; the other arguments are System's.
-    """
-    if not isinstance(f, ca.Function) or f.n_in() != 2 or f.n_out() != 1 or f.size_out(0) != f.size_in(0) or \
-            f.size2_in(0) != 1 or f.size2_in(1) != 1:
-        raise ValueError(f"System.from_casadi: got {f}; expected a casadi.Function (x [nx], u [nu]) -> xdot [nx] of "
-                         "columns")
-    nx, nu = f.size1_in(0), f.size1_in(1)
-    parts = []
-    for names, n, letter, what in ((states, nx, "x", "states"), (controls, nu, "u", "controls")):
-        chosen = [f"{letter}{i}" for i in range(n)] if names is None else list(names)
-        if len(chosen) != n:
-            raise ValueError(f"System.from_casadi: {what} has {len(chosen)} names; {f.name()} has {n}: name each")
-        parts.append(ca.vertcat(*map(ca.SX.sym, chosen)))
-    from nocl.translate.instructions import expand
-
-    x, u = parts
-    return System(name or f.name(), x=x, u=u, xdot=expand(f)(x, u), lbu=lbu, ubu=ubu, lbx=lbx, ubx=ubx, **options)
-
-
-def to_control(system: System) -> Any:
-    """python-control's NonlinearIOSystem of the system: inputs u (not clipped to U), outputs x."""
+def to_control(system: System, x: ArrayLike | None = None, u: ArrayLike | None = None) -> Any:
+    """python-control's NonlinearIOSystem: inputs u (not clipped to U), outputs x; with (x, u) the StateSpace there."""
+    if (x is None) != (u is None):
+        raise ValueError(f"to_control({system.name}): got one of x and u; expected both, or neither")
+    if x is not None and u is not None:
+        return _statespace(system, x, u)
     control, f = package("control"), system.f
 
     def update(t: float, x: Array, u: Array, params: Any) -> Array:
@@ -64,7 +32,7 @@ def to_control(system: System) -> Any:
                                      states=list(system.state_names), name=system.name)
 
 
-def to_statespace(system: System, x: ArrayLike, u: ArrayLike) -> Any:
+def _statespace(system: System, x: ArrayLike, u: ArrayLike) -> Any:
     """python-control's StateSpace of the linearisation at (x, u): A, B exact, C = I."""
     A, B = system.linearize(x, u)
     return package("control").StateSpace(A, B, np.eye(system.nx), np.zeros((system.nx, system.nu)),

@@ -15,8 +15,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from nocl.translate.kernels import CACHE_VARIABLE
-
+CACHE_VARIABLE = "NOCL_CACHE"  # names a folder for compiled code; without it it lives as long as the process
 FLAGS = ("-O2", "-march=native", "-fPIC", "-shared")
 PLAIN = ("SXFunction", "MXFunction", "Map", "BSplineInterpolant", "LinearInterpolant")  # Functions that C has all of
 

@@ -1,9 +1,8 @@
-"""Data-only files, written atomically: networks and functions, checkpoints, JSON. Nothing here can run code.
+"""Data-only files, written atomically: tensors with their structure, checkpoints, JSON. Nothing here can run code.
 
-A network, or a set of them with their functions and card, is one safetensors file: the weights as they are, bit by
-bit, and the structure (sizes, SX maps as instruction lists) as JSON in its header, under one SHA-256. One file, so
-that weights never stand beside the structure of another save. Every write goes to a temporary file in the same folder
-and is then renamed: an interrupted save leaves the former file as it was.
+Tensors are one safetensors file: the numbers as they are, bit by bit, and their structure as JSON in its header, under
+one SHA-256. One file, so that tensors never stand beside the structure of another save. Every write goes to a
+temporary file in the same folder and is then renamed: an interrupted save leaves the former file as it was.
 """
 
 from __future__ import annotations
@@ -14,70 +13,17 @@ import math
 import os
 import uuid
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 import safetensors
 import safetensors.torch
 import torch
 from torch import Tensor
 
-from nocl.nets import MLP, FeatureNet
-from nocl.translate.instructions import from_data, to_data
-
 FORMAT = 1  # raised when an older nocl could misread what is written
 SUFFIX = ".safetensors"
-
-
-@dataclass(frozen=True)
-class Record:
-    """What `save` wrote: networks and functions by name, and a card of plain JSON data."""
-
-    nets: Mapping[str, FeatureNet]
-    functions: Mapping[str, ca.Function]
-    card: Mapping[str, Any]
-
-
-def save(folder: str | Path, kind: str, *, nets: Mapping[str, FeatureNet],
-         functions: Mapping[str, ca.Function] | None = None, card: Mapping[str, Any] | None = None) -> Path:
-    """Write folder/KIND.safetensors, the whole record in one atomic file; a folder that is missing is made."""
-    tensors = {f"{name}.{key}": value for name, net in nets.items() for key, value in net.state_dict().items()}
-    structure = {"nets": {name: _net_data(net, f"{kind}: {name}") for name, net in nets.items()},
-                 "functions": {name: to_data(f) for name, f in (functions or {}).items()}, "card": dict(card or {})}
-    path = _file(folder, kind)
-    _write_tensors(path, kind, tensors, structure)
-    return path
-
-
-def load(folder: str | Path, kind: str) -> Record:
-    """What `save` wrote, bit by bit; ValueError for a missing, truncated, altered or foreign file."""
-    path = _existing(folder, kind)
-    tensors, structure = _read_tensors(path, kind)
-    try:
-        nets = {name: _build_net(data, _below(name, tensors), f"{path}: {name}")
-                for name, data in structure["nets"].items()}
-        functions = {name: from_data(data) for name, data in structure["functions"].items()}
-        return Record(nets, functions, structure["card"])
-    except (KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: {type(error).__name__} {error} in its structure; expected a {kind!r} record: "
-                         "save it again") from error
-
-
-def save_net(folder: str | Path, name: str, net: FeatureNet) -> Path:
-    """Write folder/NAME.safetensors, one network."""
-    return save(folder, name, nets={"net": net})
-
-
-def load_net(folder: str | Path, name: str) -> FeatureNet:
-    """The network that save_net wrote; errors as in `load`."""
-    nets = load(folder, name).nets
-    if set(nets) != {"net"}:
-        raise ValueError(f"{_file(folder, name)} holds {', '.join(nets) or 'no network'}; expected one network "
-                         "of save_net's: use nocl.support.store.load")
-    return nets["net"]
 
 
 def save_checkpoint(path: str | Path, state: Any, meta: Mapping[str, Any] | None = None) -> Path:
@@ -89,7 +35,7 @@ def save_checkpoint(path: str | Path, state: Any, meta: Mapping[str, Any] | None
     tensors: dict[str, Tensor] = {}
     tree = _flatten(state, "state", tensors)
     path = Path(path)
-    _write_tensors(path, "checkpoint", tensors, {"tree": tree, "meta": dict(meta or {})})
+    write_tensors(path, "checkpoint", tensors, {"tree": tree, "meta": dict(meta or {})})
     return path
 
 
@@ -98,7 +44,7 @@ def load_checkpoint(path: str | Path) -> tuple[Any, dict[str, Any]]:
     path = Path(path)
     if not path.is_file():
         raise ValueError(f"{path} does not exist; expected a checkpoint: start without resuming, or name its file")
-    tensors, structure = _read_tensors(path, "checkpoint")
+    tensors, structure = read_tensors(path, "checkpoint")
     return _unflatten(structure["tree"], tensors), structure["meta"]
 
 
@@ -155,24 +101,8 @@ def _replace(path: Path, content: bytes) -> None:
         part.unlink(missing_ok=True)
 
 
-def _file(folder: str | Path, kind: str) -> Path:
-    if not kind or kind.startswith(".") or not all(c.isalnum() or c in "_.-" for c in kind):
-        raise ValueError(f"the name of a record is {kind!r}; expected letters, digits, _ and -: it names a file")
-    return Path(folder) / (kind + SUFFIX)
-
-
-def _existing(folder: str | Path, kind: str) -> Path:
-    path, folder = _file(folder, kind), Path(folder)
-    if not folder.is_dir():
-        raise ValueError(f"{folder} is not a folder; expected one that holds {path.name}: check the path")
-    if not path.is_file():
-        there = ", ".join(sorted(p.name for p in folder.glob("*" + SUFFIX))) or "none"
-        raise ValueError(f"{folder} holds no {path.name} (records there: {there}); expected a folder that a save of "
-                         f"{kind!r} wrote: check the path")
-    return path
-
-
-def _write_tensors(path: Path, kind: str, tensors: Mapping[str, Tensor], structure: Mapping[str, Any]) -> None:
+def write_tensors(path: Path, kind: str, tensors: Mapping[str, Tensor], structure: Mapping[str, Any]) -> None:
+    """Write tensors by name and a JSON structure as one file of a kind."""
     own = {key: value.detach().cpu().clone(memory_format=torch.contiguous_format) for key, value in tensors.items()}
     try:
         text = json.dumps(structure)
@@ -183,7 +113,8 @@ def _write_tensors(path: Path, kind: str, tensors: Mapping[str, Tensor], structu
     _replace(path, safetensors.torch.save(own, header))
 
 
-def _read_tensors(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def read_tensors(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """What write_tensors wrote; ValueError for a truncated, altered or foreign file."""
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             header = file.metadata() or {}
@@ -215,40 +146,6 @@ def _digest(tensors: Mapping[str, Tensor], kind: str, structure: str) -> str:
         sha.update(f"{key} {value.dtype} {tuple(value.shape)}\n".encode())
         sha.update(value.reshape(-1).view(torch.uint8).numpy().tobytes())
     return sha.hexdigest()
-
-
-def _below(name: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {key[len(name) + 1:]: value for key, value in tensors.items() if key.startswith(name + ".")}
-
-
-def _net_data(net: FeatureNet, owner: str) -> dict[str, Any]:
-    if type(net) is not FeatureNet:
-        raise ValueError(f"{owner} is a {type(net).__name__}; expected a nocl.nets.FeatureNet: only these are "
-                         "stored as data")
-    for i, mlp in enumerate(net.nets):
-        if type(mlp) is not MLP:
-            raise ValueError(f"{owner}: network {i} is a {type(mlp).__name__}; expected a nocl.nets.MLP")
-    return {"inputs": to_data(net.inputs), "outputs": to_data(net.outputs), "training": net.training,
-            "nets": [_mlp_data(mlp) for mlp in net.nets if isinstance(mlp, MLP)]}
-
-
-def _mlp_data(mlp: MLP) -> dict[str, Any]:
-    return {"sizes": list(mlp.sizes), "activation": mlp.activation, "skip": mlp.skip is not None}
-
-
-def _build_net(data: Mapping[str, Any], weights: Mapping[str, Tensor], owner: str) -> FeatureNet:
-    with torch.device("meta"):  # no memory, and the caller's random generator is left alone
-        nets = [MLP(m["sizes"], m["activation"], m["skip"]) for m in data["nets"]]
-    net = FeatureNet(from_data(data["inputs"]), nets, from_data(data["outputs"]))
-    expected = {key: tuple(value.shape) for key, value in net.state_dict().items()}
-    got = {key: tuple(value.shape) for key, value in weights.items()}
-    if got != expected:
-        key = sorted(k for k in got.keys() | expected.keys() if got.get(k) != expected.get(k))[0]
-        raise ValueError(f"{owner}: the tensor {key} has shape {got.get(key, 'missing')}, expected "
-                         f"{expected.get(key, 'no such tensor')}: the file does not fit its own structure, save it "
-                         "again")
-    net.load_state_dict(dict(weights), assign=True)
-    return net.train(bool(data["training"]))
 
 
 def _flatten(value: Any, key: str, tensors: dict[str, Tensor]) -> Any:

@@ -16,9 +16,9 @@ from torch import Tensor
 from nocl.nets import MLP, FeatureNet
 from nocl.support.checks import Array
 from nocl.sysid import fitting
+from nocl.sysid.logs.derivatives import labels
 from nocl.sysid.logs.log import Log, Run
 from nocl.sysid.logs.shooting import Windows, fit_simulation, spread_of
-from nocl.sysid.logs.smoothing import labels
 from nocl.sysid.networks import assemble
 from nocl.sysid.progress import Progress
 from nocl.sysid.settings import LogSettings

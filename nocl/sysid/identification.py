@@ -7,6 +7,7 @@ derivatives (nocl.sysid.fitting). Where there is no structure to find, one netwo
 
 from __future__ import annotations
 
+import copy
 import time
 import warnings
 from collections.abc import Mapping, Sequence
@@ -20,14 +21,17 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
+from nocl import records
 from nocl.data import Dataset
 from nocl.exports.casadi_forms import to_casadi
+from nocl.exports.parity import Part
 from nocl.nets import MLP, FeatureNet
 from nocl.sampling import Seed
-from nocl.support import checks, store
+from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.support.threads import one_thread
 from nocl.sysid import paper
+from nocl.sysid.figures import slices
 from nocl.sysid.from_log import first_states, fit_log
 from nocl.sysid.labels import Source, box_of, data_box, find_structure, labelled, rows_of, some_labels
 from nocl.sysid.logs.coverage import Coverage, share_of_nodes
@@ -72,6 +76,15 @@ class LearnedDynamics:
         """f:(x, u)->(xdot), native MX, equal to torch to rounding."""
         return to_casadi(self.net, name="f", in_names=["x", "u"], out_names=["xdot"])
 
+    def export_parts(self) -> list[Part]:
+        """What nocl.exports.bundle.export writes: f_theta."""
+        s = self.system
+        box = {"x": (s.lbx, s.ubx), "u": (s.lbu, s.ubu)}
+        labels = {"x": [s.unit(n) for n in s.state_names], "u": [s.unit(n) for n in s.control_names],
+                  "xdot": [f"d {n} / dt" for n in s.state_names]}
+        net = copy.deepcopy(self.net).double().eval()
+        return [Part("dynamics", self.to_casadi(), net, box, labels, net)]
+
     def to_system(self) -> System:
         """The system with f_theta for its equations, in its own symbols: for problems on a plant that is not known.
 
@@ -105,9 +118,7 @@ class LearnedDynamics:
 
     def plot(self) -> Figure:
         """f_theta, and the exact f where it is known, along each variable through the middle of the box."""
-        from nocl.sysid.figures import slices
-
-        return slices(self)
+        return slices(self.system, self)
 
     def score(self, n: int = 2000, seed: Seed = 1_000_003) -> Score:
         """Errors against the exact f at n fresh uniform samples of the box X x U; ValueError where f is not known."""
@@ -133,12 +144,12 @@ class LearnedDynamics:
         card = {"system": self.system.to_data(), "structure": self.structure, "card": dict(self.card), "parts": parts,
                 "coverage": coverage}
         known = {} if self.parts is None else {"linear": self.parts.linear, "exact": self.parts.exact}
-        return store.save(folder, KIND, nets={"f": self.net}, functions=known, card=card)
+        return records.save(folder, KIND, nets={"f": self.net}, functions=known, card=card)
 
     @staticmethod
     def load(folder: str | Path) -> LearnedDynamics:
         """What `save` wrote, bit by bit; ValueError for a missing, altered or foreign file."""
-        record = store.load(folder, KIND)
+        record = records.load(folder, KIND)
         system = System.from_data(record.card["system"])
         parts = _structure_from(record.card["parts"], record.functions, box_of(system))
         coverage = record.card.get("coverage")

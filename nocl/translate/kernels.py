@@ -20,9 +20,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from nocl.support.compiler import CACHE_VARIABLE
 from nocl.translate.instructions import instructions
 
-CACHE_VARIABLE = "NOCL_CACHE"  # names a folder for compiled kernels; without it they live as long as the process
 HEADERS = Path(__file__).parent / "csrc"
 FLAGS = ("-std=gnu11", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-flax-vector-conversions",
          "-Wno-psabi", "-fPIC", "-shared")

@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+from nocl import records
 from nocl.exports.casadi_forms import to_casadi
 from nocl.exports.parity import Certificate, Part
 from nocl.judge import dynamics_function
@@ -21,7 +22,7 @@ from nocl.nets import FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.cnd.features import at_rate
 from nocl.solvers.cnd.labels import LONGEST
-from nocl.support import checks, store
+from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.translate.torch_functions import to_torch
 
@@ -116,7 +117,7 @@ class CND:
         x, t = pi.mx_in()
         return ca.Function("closed_loop", [x, t], [ca.densify(f(x, pi(x, t)))], ["x", "t"], ["xdot"])
 
-    def parts(self) -> list[Part]:
+    def export_parts(self) -> list[Part]:
         """What is exported: policy, gain and closed loop, and value and value gradient where it has a value."""
         s, policy, value = self.ocp.system, self.policy, self.value_net
         box = {"x": (s.lbx, s.ubx), "t": (0.0, self.ocp.horizon)}
@@ -143,7 +144,7 @@ class CND:
         Each with header, test vectors and self-test, as SYSTEM_policy, SYSTEM_gain, ...; dtype "float64" or "float32";
         only: names of `parts()`.
         """
-        there = {part.name: part for part in self.parts()}
+        there = {part.name: part for part in self.export_parts()}
         wanted = [n for n in there if n != "closed_loop"] if only is None else list(only)
         for name in wanted:
             if name not in there:
@@ -174,12 +175,12 @@ class CND:
         """Write controller, value, problem and card as one data-only file in `folder`."""
         policy = self.policy if self._at_rates is None else self._at_rates
         nets = {"policy": _smallest(policy)} | ({} if self.value_net is None else {"value": _smallest(self.value_net)})
-        return store.save(Path(folder), KIND, nets=nets, card={"ocp": self.ocp.to_data(), "card": self.card})
+        return records.save(Path(folder), KIND, nets=nets, card={"ocp": self.ocp.to_data(), "card": self.card})
 
     @classmethod
     def load(cls, folder: str | os.PathLike[str]) -> CND:
         """What `save` wrote; raises ValueError for a missing, damaged or foreign file."""
-        record = store.load(Path(folder), KIND)
+        record = records.load(Path(folder), KIND)
         try:
             ocp, nets = OCP.from_data(record.card["ocp"]), record.nets
             return cls(ocp, nets["policy"], nets.get("value"), record.card["card"])

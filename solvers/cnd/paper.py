@@ -39,7 +39,7 @@ from nocl import hjb
 from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.cnd.identity import identity
-from nocl.solvers.cnd.paper_settings import STEPS, PaperSettings
+from nocl.solvers.cnd.published_settings import STEPS, PaperSettings
 from nocl.support import store
 from nocl.translate.fused import FusedStep
 from nocl.translate.torch_functions import to_torch
@@ -318,7 +318,7 @@ def _torch_dynamics(ocp: OCP, dynamics: Any, device: str | torch.device, dtype: 
 
 def _fused(ocp: OCP) -> hjb.Step:
     try:
-        return FusedStep(ocp)
+        return FusedStep(ocp.system.f, ocp.L_soft)
     except ValueError as error:
         raise ValueError(f"{error}; or set fused=False, which is slower") from None
 

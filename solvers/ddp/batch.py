@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from nocl.ocp import OCP
 from nocl.support.checks import Array
-
-if TYPE_CHECKING:
-    from nocl.solvers.ddp.solver import DDP
 
 Rows = NDArray[np.int64]  # problem numbers
 MOST = 1024  # problems in a piece: fills many threads, and shows progress
@@ -67,6 +65,15 @@ class DDPSolution:
         return DDPSolution(**{"V_xx": None, **arrays})
 
 
+class Descent(Protocol):
+    """What solves a piece of a batch."""
+
+    ocp: OCP
+    intervals: int
+
+    def descend(self, batch: Batch) -> DDPSolution: ...
+
+
 @dataclass(frozen=True, eq=False)
 class Batch:
     """A piece of a batch: problems first, first + 1, ... of it; a task of solvers/pool.py."""
@@ -107,7 +114,7 @@ class Solved:
 class Job:
     """What a worker does with a piece."""
 
-    ddp: DDP
+    ddp: Descent
 
     def build(self) -> None:
         """The kernel is built with the DDP, on unpickling."""
@@ -116,13 +123,13 @@ class Job:
         return Solved(task.name, task.first, self.ddp.descend(task))
 
 
-def bytes_each(ddp: DDP, curvature: bool) -> int:
+def bytes_each(ddp: Descent, curvature: bool) -> int:
     """What one problem takes while it is solved."""
     K, nx, nu = ddp.intervals, ddp.ocp.system.nx, ddp.ocp.system.nu
     return 8 * (K + 1) * (4 * nx + 4 * nu + 2 * nu * nx + 3 + (nx * nx if curvature else 0))
 
 
-def pieces(ddp: DDP, x0: Array, t0: Array, guess: dict[str, Array], curvature: bool) -> list[Batch]:
+def pieces(ddp: Descent, x0: Array, t0: Array, guess: dict[str, Array], curvature: bool) -> list[Batch]:
     """Pieces of MOST problems, fewer where these would take more than BYTES; the same for any workers."""
     n = max(1, min(MOST, BYTES // bytes_each(ddp, curvature)))
     return [Batch(f"piece-{i:09d}", i, x0[i:i + n], t0[i:i + n], {k: v[i:i + n] for k, v in guess.items()}, curvature)

@@ -3,20 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nocl.data import Solution, Trajectory
+from nocl.ocp import OCP
 from nocl.support import checks
 from nocl.support.checks import Array
 
-if TYPE_CHECKING:
-    from nocl.solvers.nmpc.solver import NMPC
-
 LAST = 0.95  # largest share of what is left of the horizon that a closed loop's first interval may take
 NEAR_END = 1e-6  # of the horizon: a call this late is taken as one just before the end
+
+
+class Planner(Protocol):
+    """What a loop solves by: NMPC."""
+
+    @property
+    def ocp(self) -> OCP: ...
+    @property
+    def intervals(self) -> int: ...
+    @property
+    def window(self) -> float: ...
+
+    def solve(self, x0: ArrayLike, guess: Any = None, *, nodes: ArrayLike | None = None, workers: int | str = "auto",
+              progress: bool | None = None) -> Solution: ...
 
 
 class Loop:
@@ -33,7 +45,7 @@ class Loop:
     is none yet. A failure is never silent: success is False there, and `failures` counts them.
     """
 
-    def __init__(self, nmpc: NMPC, hold: int | None = None, receding: bool = False) -> None:
+    def __init__(self, nmpc: Planner, hold: int | None = None, receding: bool = False) -> None:
         if hold is not None and (isinstance(hold, bool) or not isinstance(hold, (int, np.integer)) or hold < 1):
             raise ValueError(f"hold is {hold!r}; expected how many controls the horizon has, an integer >= 1")
         self.nmpc, self.hold, self.receding = nmpc, hold or nmpc.intervals, receding
@@ -84,7 +96,7 @@ class Loop:
         warm = self.plan is not None
         plan = Trajectory(nodes, *guess) if warm else None
         solution = self.nmpc.solve(x, plan, nodes=nodes, workers=1, progress=False)
-        failed = np.flatnonzero(~np.asarray(solution.success))
+        failed = np.flatnonzero(~np.asarray(solution.success, dtype=bool))
         if warm and failed.size:
             again = self.nmpc.solve(x[failed], nodes=nodes, workers=1, progress=False)
             solution = _put(solution, again, failed)

@@ -7,7 +7,7 @@ import io
 from pathlib import Path
 from typing import Any
 
-from nocl.exports.interop import package
+from nocl.support.packages import package
 from nocl.support.store import write_bytes
 
 Table = dict[str, Any]  # column name -> its cells, in order

@@ -11,17 +11,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from nocl.support.checks import Array
 from nocl.sysid.logs.files import Table, read_table, write_table
+from nocl.sysid.logs.smoothing import Smooth, smooth
 from nocl.system import System, counted
-
-if TYPE_CHECKING:
-    from nocl.sysid.logs.smoothing import Smooth
 
 TIME, RUN = "t", "run"
 LEAST = 5  # samples of a piece: fewer have no smoothed derivative
@@ -43,8 +41,6 @@ class Run:
     @cached_property
     def smooth(self) -> Smooth:
         """Smoothed states and derivatives (nocl.sysid.logs.smoothing)."""
-        from nocl.sysid.logs.smoothing import smooth
-
         return smooth(self.t, self.x)
 
 

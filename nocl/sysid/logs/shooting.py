@@ -25,8 +25,8 @@ from torch.func import functional_call, jacrev, vmap
 
 from nocl.nets import FeatureNet
 from nocl.support.checks import Array
+from nocl.sysid.logs.derivatives import noise
 from nocl.sysid.logs.log import Log
-from nocl.sysid.logs.smoothing import noise
 from nocl.translate.rk4 import rk4_interval
 
 NOISE_FLOOR = 1e-3  # of a state's spread: logs without noise would weigh rounding

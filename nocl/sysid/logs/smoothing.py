@@ -12,9 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.interpolate import make_smoothing_spline
 
-from nocl.data import Dataset
 from nocl.support.checks import Array
-from nocl.sysid.logs.log import Log, Run
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,22 +42,3 @@ def _spline(t: Array, x: Array, middle: Array) -> tuple[Array, Array, Array]:
     at, mid = (t - t[0]) / unit, (middle - t[0]) / unit
     offset = x[there][0]
     return offset + scale * spline(at), offset + scale * spline(mid), scale / unit * spline.derivative()(mid)
-
-
-def noise(log: Log) -> Array:
-    """The root mean square of what smoothing took away, for each state [nx]."""
-    return np.sqrt(np.nanmean(np.square(np.concatenate([r.smooth.residual for r in log])), axis=0))
-
-
-def dataset(log: Log) -> Dataset:
-    """The log as labels without Jacobians: logged derivatives where there are any, else smoothed ones."""
-    x, u, xdot = zip(*map(labels, log), strict=True)
-    return Dataset(np.concatenate(x), np.concatenate(u), np.concatenate(xdot))
-
-
-def labels(run: Run) -> tuple[Array, Array, Array]:
-    """(x, u, xdot) of one run, a row for each label."""
-    if run.xdot is None:
-        return run.smooth.middle, run.u, run.smooth.xdot
-    there = np.isfinite(run.xdot[:-1]).all(axis=1) & np.isfinite(run.x[:-1]).all(axis=1)
-    return run.x[:-1][there], run.u[there], run.xdot[:-1][there]
