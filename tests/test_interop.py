@@ -144,6 +144,7 @@ def test_missing_packages_say_how_to_install_them(ocp, monkeypatch):
     modules = __import__("sys").modules
     for name in ("control", "gymnasium", "do_mpc", "acados_template"):
         monkeypatch.setitem(modules, name, None)
-    for call in (ocp.system.to_control, ocp.to_gymnasium, ocp.system.to_do_mpc, ocp.system.to_acados):
+    for call, thing in ((nocl.to_control, ocp.system), (nocl.to_gymnasium, ocp), (nocl.to_do_mpc, ocp.system),
+                        (nocl.to_acados, ocp.system)):
         with pytest.raises(ValueError, match="pip install"):
-            call()
+            call(thing)
