@@ -21,7 +21,7 @@ import numpy as np
 
 from nocl.comparisons.report.results import OPEN_LOOP, Plan, count
 from nocl.data import Solution
-from nocl.judge import policy_function
+from nocl.judge import check_made_for, policy_function
 from nocl.ocp import OCP
 from nocl.solvers.nmpc.loop import Loop
 from nocl.support.checks import Array
@@ -113,6 +113,7 @@ def runs_of(ocp: OCP, methods: Mapping[str, Any], x0: Array, rates: Rates, solvi
 
 
 def _check(ocp: OCP, name: str, method: Any, x0: Array) -> None:
+    check_made_for(ocp, method, f"method {name!r}")
     if isinstance(method, Solution):
         _check_solution(ocp, name, method, x0)
     elif _policy(ocp, name, method) is None and not hasattr(method, "solve") and not callable(method):

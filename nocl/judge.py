@@ -71,6 +71,7 @@ def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: i
     Raises ValueError for shapes that do not fit. A state that blows up or a NaN control is a row with success False.
     """
     checks.problem(ocp, "simulate")
+    check_made_for(ocp, controller, "the controller")
     rows, _ = checks.states(x0, ocp.system.nx, ocp.system.name)
     _check_options(ocp, hold, nodes, t0)
     judge = _Judge(ocp, dynamics_function(ocp, f), rtol, atol)
@@ -86,6 +87,15 @@ def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: i
         ask, K = _feedback(ocp, controller, policy), hold or nodes - 1
         _check_delay(delay, (ocp.horizon - t0) / K, f"feedback that is sampled {K} times: sample it less often")
     return judge.held(ask, rows, np.linspace(t0, ocp.horizon, K + 1), jumps, delay)
+
+
+def check_made_for(ocp: OCP, thing: Any, what: str) -> None:
+    """ValueError where `thing` (a controller, a value function) was made for a problem on another system."""
+    made_for = getattr(thing, "ocp", None)
+    if isinstance(made_for, OCP) and (differ := ocp.system.difference(made_for.system)):
+        raise ValueError(f"{what} was made for {made_for.system.name!r}, which is another system than this problem's "
+                         f"{ocp.system.name!r}: {differ}; expected one made for it (to try a controller on another "
+                         "plant, keep its problem and pass the plant's equations, simulate(..., f=))")
 
 
 def dynamics_function(ocp: OCP, f: Any) -> ca.Function:
@@ -131,6 +141,13 @@ def _check_options(ocp: OCP, hold: int | None, nodes: int, t0: float) -> None:
         raise ValueError(f"t0 is {t0!r}; expected 0 <= t0 < {ocp.horizon:g}, the horizon")
 
 
+def _numbers(value: ArrayLike, what: str) -> Array:
+    try:
+        return checks.real(value)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"simulate: {what} cannot be read: {error}; expected an array of numbers") from None
+
+
 def _check_delay(delay: float, most: float, of: str) -> None:
     if not 0 <= delay <= most * (1 + 1e-9):
         raise ValueError(f"delay is {delay!r}; expected 0 <= delay <= {most:g} for {of}")
@@ -140,7 +157,7 @@ def _jumps(ocp: OCP, kicks: Kicks | None, B: int, t0: float) -> list[tuple[float
     """The kicks in order of time, as rows [B, nx]."""
     jumps = []
     for time, dx in kicks or ():
-        d = np.asarray(dx, dtype=np.float64)
+        d = _numbers(dx, f"the kick at t = {time:g}")
         if d.shape not in ((ocp.system.nx,), (B, ocp.system.nx)) or not np.isfinite(d).all():
             raise ValueError(f"the kick at t = {time:g} has shape {d.shape}; expected finite ({ocp.system.nx},) or "
                              f"({B}, {ocp.system.nx})")
@@ -154,7 +171,7 @@ Ask = Callable[[Array, float, int], Array]  # (x [B, nx], t, interval) -> u [B, 
 
 
 def _open_loop(ocp: OCP, controls: ArrayLike, B: int, hold: int | None, t0: float) -> tuple[Ask, int]:
-    u = np.asarray(controls, dtype=np.float64)
+    u = _numbers(controls, "the controls")
     if u.ndim == 2 and B == 1:
         u = u[None]
     if u.ndim != 3 or u.shape[0] != B or u.shape[2] != ocp.system.nu or u.shape[1] < 1:

@@ -14,7 +14,7 @@ import numpy as np
 from nocl import pretty, sampling
 from nocl.sampling import Distribution, Gaussian, Uniform, short
 from nocl.support import checks
-from nocl.support.checks import Array, Vector
+from nocl.support.checks import MALFORMED, Array, Vector
 from nocl.system import System
 from nocl.translate import instructions
 
@@ -197,7 +197,7 @@ class OCP:
                        initial_states=sampling.from_data(data["initial_states"]),
                        path_constraints=dict(zip(data["path_constraints"], constraints, strict=True)),
                        penalty=data["penalty"], penalty_margin=data["penalty_margin"])
-        except (KeyError, TypeError, AttributeError, NotImplementedError, RuntimeError) as error:
+        except MALFORMED as error:
             raise ValueError(f"not an OCP written by nocl: {type(error).__name__}: {error}") from error
 
     def __reduce__(self) -> tuple[Any, ...]:

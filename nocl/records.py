@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 from nocl.nets import MLP, FeatureNet
+from nocl.support.checks import MALFORMED
 from nocl.support.store import SUFFIX, read_tensors, write_tensors
 from nocl.translate.instructions import from_data, to_data
 
@@ -49,7 +50,7 @@ def load(folder: str | Path, kind: str) -> Record:
                 for name, data in structure["nets"].items()}
         functions = {name: from_data(data) for name, data in structure["functions"].items()}
         return Record(nets, functions, structure["card"])
-    except (KeyError, TypeError, AttributeError) as error:
+    except MALFORMED as error:
         raise ValueError(f"{path}: {type(error).__name__} {error} in its structure; expected a {kind!r} record: "
                          "save it again") from error
 
@@ -115,5 +116,9 @@ def _build_net(data: Mapping[str, Any], weights: Mapping[str, Tensor], owner: st
         raise ValueError(f"{owner}: the tensor {key} has shape {got.get(key, 'missing')}, expected "
                          f"{expected.get(key, 'no such tensor')}: the file does not fit its own structure, save it "
                          "again")
+    for key, value in weights.items():
+        if not torch.isfinite(value).all():
+            raise ValueError(f"{owner}: the tensor {key} holds NaN or inf; expected finite weights: what was saved is "
+                             "of no use, train it again")
     net.load_state_dict(dict(weights), assign=True)
     return net.train(bool(data["training"]))

@@ -15,9 +15,10 @@ from numpy.typing import ArrayLike
 
 from nocl import pretty
 from nocl.support import checks
-from nocl.support.checks import Array, Vector
+from nocl.support.checks import MALFORMED, Array, Vector
 from nocl.translate import instructions
 
+N_SAME, SAME = 16, 1e-9  # points, and relative to usual values: equations that agree so far are the same
 N_PROBES = 512  # points of the box at which the equations are tried on construction
 
 
@@ -162,6 +163,22 @@ class System:
         A, B = self.jacobian(checks.vector(x, self.nx, "x", owner), checks.vector(u, self.nu, "u", owner))
         return A.full(), B.full()
 
+    def difference(self, other: System) -> str:
+        """What tells another system from this one, names or equations; "" where they are the same."""
+        for what, own, theirs in (("states", self.state_names, other.state_names),
+                                  ("controls", self.control_names, other.control_names)):
+            if own != theirs:
+                return f"its {what} are {', '.join(theirs)}, not {', '.join(own)}"
+        if self.xdot is None or other.xdot is None or self.xdot is other.xdot:
+            return ""
+        rng = np.random.default_rng(0)
+        x = rng.uniform(self.lbx, self.ubx, (N_SAME, self.nx)).T
+        u = rng.uniform(self.lbu, self.ubu, (N_SAME, self.nu)).T
+        own, theirs = self.f(x, u).full(), other.f(x, u).full()
+        usual = np.abs(own).max(axis=1, keepdims=True)
+        rows = np.flatnonzero((~(np.abs(theirs - own) <= SAME * (usual + np.abs(own)))).any(axis=1))
+        return "its equation(s) of " + ", ".join(self.state_names[i] for i in rows) + " are others" if rows.size else ""
+
     def unit(self, name: str) -> str:
         """The unit of a state or control for an axis label, like 'theta [rad]' or just 'theta'."""
         return f"{name} [{self.units[name]}]" if name in self.units else name
@@ -196,7 +213,7 @@ class System:
             xdot = None if data["f"] is None else instructions.from_data(data["f"], [x, u])(x, u)
             return System(data["name"], x=x, u=u, xdot=xdot, angles=data["angles"], units=data["units"],
                           **{name: data[name] for name in ("lbu", "ubu", "lbx", "ubx")})
-        except (KeyError, TypeError, AttributeError, NotImplementedError, RuntimeError) as error:
+        except MALFORMED as error:
             raise ValueError(f"not a System written by nocl: {type(error).__name__}: {error}") from error
 
     @staticmethod

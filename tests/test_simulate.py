@@ -223,7 +223,7 @@ def test_bad_input(kwargs, words):
 
 
 def test_the_judge_needs_no_torch():
-    code = "import sys, nocl.simulate; sys.exit('torch' in sys.modules)"
+    code = "import sys, nocl.judge; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

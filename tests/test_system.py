@@ -132,7 +132,7 @@ MISTAKES = [
     ({"xdot": "omega"}, "xdot is a str"),
     ({"lbu": [-1.0, 0.0]}, r"lbu has shape \(2,\), expected \(1,\): pass one number per coordinate"),
     ({"lbu": -1.0}, r"lbu has shape \(\)"),
-    ({"ubu": ["a"]}, r"ubu is \['a'\]; expected 1 numbers"),
+    ({"ubu": ["a"]}, r"ubu is \['a'\], which holds text, not numbers: convert it; expected 1 numbers"),
     ({"ubu": None}, "ubu"),
     ({"lbu": [np.nan]}, "lbu is .*nan.* NaN: check how it was computed"),
     ({"ubu": [np.inf]}, r"tau is in \[-1\.0, inf\]; expected finite bounds"),

@@ -11,15 +11,45 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 Array = NDArray[np.float64]
+MALFORMED = (KeyError, IndexError, TypeError, AttributeError, NotImplementedError, RuntimeError, RecursionError,
+             OverflowError, MemoryError)  # what data of another form than expected raises on its way through a reader
 Vector = Any  # a field that takes what a user writes (a list, an array) and holds a read-only Array
+
+
+def real(value: ArrayLike) -> Array:
+    """`value` as a new float64 array; ValueError, saying why, for what numpy would turn into numbers without a word."""
+    array = value if isinstance(value, np.ndarray) else np.asarray(value)
+    if isinstance(value, np.ma.MaskedArray):
+        raise ValueError("is a masked array, whose masked entries would count: fill or drop them")
+    if array.dtype.kind not in "iuf" and not (array.dtype.kind == "O" and all(map(_is_real, array.flat))):
+        raise ValueError(f"holds {_kind(array)}, not numbers: convert it")
+    return np.array(array, dtype=np.float64)
+
+
+def _is_real(value: Any) -> bool:
+    return isinstance(value, numbers.Real) and not isinstance(value, bool)
+
+
+def _kind(array: Any) -> str:
+    if array.dtype.kind == "O":
+        return ", ".join(sorted({type(v).__name__ for v in array.flat if not _is_real(v)}))
+    return {"b": "True and False", "c": "complex numbers", "U": "text", "S": "bytes", "M": "dates",
+            "m": "spans of time"}.get(array.dtype.kind, str(array.dtype))
+
+
+def shown(value: Any, most: int = 120) -> str:
+    """repr, cut off where it is long: errors are to be read."""
+    text = " ".join(repr(value).split())
+    return text if len(text) <= most else f"{text[:most]} ..."
 
 
 def vector(value: ArrayLike, n: int, name: str, owner: str) -> Array:
     """A read-only float64 vector of length n without NaN; raises ValueError otherwise."""
     try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"{owner}: {name} is {value!r}; expected {n} numbers: pass a list of floats") from None
+        array = real(value)
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
+        raise ValueError(f"{owner}: {name} is {shown(value)}, which {_why(error)}; expected {n} numbers: pass a list "
+                         "of floats") from None
     if array.shape != (n,):
         raise ValueError(f"{owner}: {name} has shape {array.shape}, expected ({n},): pass one number per coordinate")
     if np.isnan(array).any():
@@ -31,9 +61,10 @@ def vector(value: ArrayLike, n: int, name: str, owner: str) -> Array:
 def weight(value: ArrayLike, n: int, name: str, owner: str) -> Array:
     """A weight of a quadratic cost as a symmetric positive semidefinite [n, n], from a number, diagonal or matrix."""
     try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"{owner}: the weight {name} is {value!r}; expected a number, [{n}] or [{n}, {n}]") from None
+        array = real(value)
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
+        raise ValueError(f"{owner}: the weight {name} is {shown(value)}, which {_why(error)}; expected a number, "
+                         f"[{n}] or [{n}, {n}]") from None
     matrix = array * np.eye(n) if array.shape in ((), (n,)) else array
     if matrix.shape != (n, n):
         raise ValueError(f"{owner}: the weight {name} has shape {array.shape}; expected a number, [{n}] or [{n}, {n}]")
@@ -152,12 +183,22 @@ def problem(ocp: Any, owner: str) -> None:
                          "nocl.OCP(system, ...) or nocl.load_ocp(name)")
 
 
+def _why(error: Exception) -> str:
+    """What `real` said, or that numpy could make no array of it."""
+    text = str(error)
+    return text if text.startswith(("is a masked", "holds ")) else "makes no array of numbers"
+
+
 def states(x: ArrayLike, nx: int, owner: str, name: str = "x0") -> tuple[Array, bool]:
     """States as float64 rows [B, nx], and whether a single [nx] was given; NaN and other shapes raise ValueError."""
+    if hasattr(x, "columns") and hasattr(x, "dtypes"):  # a table: which column is which is not for numpy to guess
+        raise ValueError(f"{name} is a {type(x).__name__} with columns {shown(list(x.columns))}; expected an array "
+                         f"[{nx}] or [B, {nx}]: pick the columns in {owner}'s order, table[[...]].to_numpy()")
     try:
-        array = np.asarray(x, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"{name} is {x!r}; {owner} has nx = {nx}: pass numbers [nx] or [B, nx]") from None
+        array = real(x)
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
+        raise ValueError(f"{name} is {shown(x)}, which {_why(error)}; {owner} has nx = {nx}: pass numbers [nx] or "
+                         "[B, nx]") from None
     single = array.ndim == 1
     rows = array[None, :] if single else array
     if rows.ndim != 2 or rows.shape[1] != nx:

@@ -22,6 +22,8 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
+from nocl.support.checks import MALFORMED
+
 FORMAT = 1  # raised when an older nocl could misread what is written
 SUFFIX = ".safetensors"
 
@@ -45,7 +47,11 @@ def load_checkpoint(path: str | Path) -> tuple[Any, dict[str, Any]]:
     if not path.is_file():
         raise ValueError(f"{path} does not exist; expected a checkpoint: start without resuming, or name its file")
     tensors, structure = read_tensors(path, "checkpoint")
-    return _unflatten(structure["tree"], tensors), structure["meta"]
+    try:
+        return _unflatten(structure["tree"], tensors), structure["meta"]
+    except (*MALFORMED, ValueError) as error:
+        raise ValueError(f"{path}: {type(error).__name__} {error} in its structure; expected a checkpoint of nocl's: "
+                         "start without resuming") from error
 
 
 def write_json(path: str | Path, data: Any) -> Path:
@@ -63,7 +69,7 @@ def read_json(path: str | Path) -> Any:
     except OSError as error:
         raise ValueError(f"{path} cannot be read ({error.strerror}); expected a JSON file that nocl wrote: "
                          "check the folder") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not JSON ({error}); expected a file that nocl wrote: it was cut off or edited, "
                          "write it again") from error
 
@@ -131,7 +137,13 @@ def read_tensors(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, An
     if header.get("sha256") != _digest(tensors, kind, text):
         raise ValueError(f"{path} was altered after it was saved (its SHA-256 does not fit); expected the file as "
                          "written: take a copy or save it again")
-    return tensors, json.loads(text)
+    try:
+        structure = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: its structure is not JSON ({error}): save it again") from error
+    if not isinstance(structure, dict):
+        raise ValueError(f"{path}: its structure is a {type(structure).__name__}, expected a dict: save it again")
+    return tensors, structure
 
 
 def _what(header: Mapping[str, str]) -> str:

@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 
+from nocl.support.checks import MALFORMED
+
 OPERATIONS = {getattr(ca, name): name for name in dir(ca) if name.startswith("OP_")}
 _UNARY = ("ASSIGN NEG EXP LOG SQRT SQ TWICE SIN COS TAN ASIN ACOS ATAN NOT FLOOR CEIL FABS SIGN ERF INV "
           "SINH COSH TANH ASINH ACOSH ATANH ERFINV LOG1P EXPM1")
@@ -79,7 +81,7 @@ def from_data(data: Mapping[str, Any], inputs: list[ca.SX] | None = None) -> ca.
         _run(data["code"], [ca.SX(0)] * int(data["work"]), symbols, outputs)
         names_in, names_out = ([name for name, *_ in data[key]] for key in ("inputs", "outputs"))
         return ca.Function(data["name"], symbols, outputs, names_in, names_out)
-    except (KeyError, IndexError, TypeError, AttributeError, RuntimeError) as error:
+    except MALFORMED as error:
         raise ValueError(f"not a function written by nocl: {type(error).__name__}: {error}") from error
 
 

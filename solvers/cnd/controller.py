@@ -183,9 +183,12 @@ class CND:
         record = records.load(Path(folder), KIND)
         try:
             ocp, nets = OCP.from_data(record.card["ocp"]), record.nets
+            _check_sizes(ocp, nets)
             return cls(ocp, nets["policy"], nets.get("value"), record.card["card"])
         except KeyError as error:
             raise ValueError(f"{folder}: not a controller written by nocl: {error} is missing") from None
+        except checks.MALFORMED as error:
+            raise ValueError(f"{folder}: not a controller written by nocl: {type(error).__name__} {error}") from None
 
     def __repr__(self) -> str:
         facts = ", ".join(f"{k} {v}" for k, v in self.card.items() if isinstance(v, (str, int, float)))
@@ -234,6 +237,18 @@ def _smallest(net: FeatureNet) -> FeatureNet:
         if all(bool((p == p.to(dtype).double()).all()) for p in net.parameters()):
             return copy.deepcopy(net).to(dtype)
     return net
+
+
+def _check_sizes(ocp: OCP, nets: Mapping[str, FeatureNet]) -> None:
+    """ValueError where a file's networks do not fit its own problem."""
+    n, s = [ocp.system.nx, 1], ocp.system
+    for name, outputs in (("policy", s.nu), ("value", 1)):
+        if name not in nets:
+            continue
+        got, answer = [nets[name].inputs.size1_in(i) for i in range(nets[name].inputs.n_in())], nets[name].outputs
+        if got not in (n, [*n, 1]) or answer.size1_out(0) != outputs:
+            raise ValueError(f"the {name} takes {got} and gives {answer.size1_out(0)} numbers; {s.name!r} needs {n} -> "
+                             f"{outputs}: the file does not fit its own problem, save it again")
 
 
 def pretrained(name: str, dynamics: str = "exact") -> CND:

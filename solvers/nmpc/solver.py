@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nocl.data import Solution, Trajectory
-from nocl.judge import dynamics_function
+from nocl.judge import check_made_for, dynamics_function
 from nocl.ocp import OCP
 from nocl.solvers.lqr import LQR
 from nocl.solvers.nmpc import guesses as starting
@@ -232,6 +232,7 @@ def _terminal(ocp: OCP, terminal: Any) -> ca.Function | None:
     """The terminal cost as a casadi.Function (x) or (x, t) -> number."""
     if terminal is None:
         return None
+    check_made_for(ocp, terminal, "NMPC: the terminal cost")
     g = terminal.value_to_casadi() if hasattr(terminal, "value_to_casadi") else terminal
     if not isinstance(g, ca.Function):
         raise ValueError(f"NMPC: terminal is a {type(terminal).__name__}; expected a casadi.Function (x) or (x, t) -> "
