@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from nocl.ocp import OCP
 from nocl.sampling import Gaussian, Uniform
+from nocl.smoothness import smooth_abs, smooth_max, split_controls
 from nocl.system import System
 
 if TYPE_CHECKING:
@@ -24,7 +25,8 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = ["CND", "OCP", "Dataset", "Ensemble", "Gaussian", "LearnedDynamics", "Log", "Solution", "System",
-           "Trajectory", "Uniform", "identify", "load_ocp", "pretrained", "simulate", "to_acados", "to_casadi",
+           "Trajectory", "Uniform", "identify", "load_ocp", "pretrained", "simulate",
+           "smooth_abs", "smooth_max", "split_controls", "to_acados", "to_casadi",
            "to_control", "to_do_mpc", "to_gymnasium", "to_torch", "train"]
 
 _LAZY = {  # public name -> module: torch and the solvers are imported when first used

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,10 +14,14 @@ import numpy as np
 
 from nocl import pretty, sampling
 from nocl.sampling import Distribution, Gaussian, Uniform, short
+from nocl.smoothness import kinks, linear_controls
 from nocl.support import checks
 from nocl.support.checks import MALFORMED, Array, Vector
 from nocl.system import System
 from nocl.translate import instructions
+
+KINKS = ("solvers that use second derivatives may fail there; smooth it, nocl.smooth_abs(e, width) or "
+         "nocl.smooth_max(a, b, width), or split a control, nocl.split_controls(system, names)")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -71,6 +76,8 @@ class OCP:
         self._check_goal(owner)
         self._check_initial_states(owner)
         self._check_finite(owner)
+        if self.kinks:
+            warnings.warn(f"{owner}: {'; '.join(self.kinks)}: {KINKS}", UserWarning, stacklevel=3)
 
     def _set(self, **values: object) -> None:
         for key, value in values.items():
@@ -124,6 +131,26 @@ class OCP:
                     where = "the goal" if bad[0] == 0 else "an initial state"
                     raise ValueError(f"{owner}: {order}{what} gives NaN or inf at {where}, x = {short(x[:, bad[0]])}; "
                                      "expected finite values: square a norm, or smooth it as sqrt(d^2 + 1e-6)")
+
+    @cached_property
+    def kinks(self) -> tuple[str, ...]:
+        """Where L, G or a path constraint is not smooth, in words."""
+        s, z = self.system, ca.vertcat(self.system.x, self.system.u)
+        lower, upper = np.r_[s.lbx, s.lbu], np.r_[s.ubx, s.ubu]
+        parts = {"the running cost": self.running, "the terminal cost": self.terminal,
+                 **{f"path constraint {name!r}": h for name, h in self.path_constraints.items()}}
+        return tuple(f"{what} has {kink}" for what, e in parts.items() for kink in kinks(e, z, lower, upper))
+
+    def check_strict(self, owner: str) -> None:
+        """ValueError where the Hamiltonian is linear in a control, so that second derivatives say nothing of it."""
+        if self.system.xdot is None:
+            return  # the equations are learned: nothing is known of them yet
+        names = linear_controls(self.running, self.system.xdot, self.system.u)
+        if names:
+            raise ValueError(f"{owner}: cost and dynamics are linear in {', '.join(names)}: the optimum jumps between "
+                             "bounds (bang-bang), which no smooth controller has; expected a cost that curves in each "
+                             "control: add a small quadratic term, a thousandth of the usual running cost times "
+                             f"(({names[0]} - its goal) / its range)**2, or solve state by state with NMPC")
 
     @classmethod
     def quadratic(cls, system: System, *, x_goal: Vector, u_goal: Vector, R: Vector = 0.01, P: Vector = 1.0,

@@ -98,6 +98,7 @@ class Stages:
 
     def train(self, exact: bool) -> CND:
         """The controller and value function, in cnd/; on dynamics/ unless exact."""
+        self.ocp.check_strict("train")  # before dynamics are learned for nothing
         model = None if exact else self.identify()
         data = {} if model is None else {k: v for k, v in model.card[KEY].items() if k == "data"}
         made_from, there = self._made_from(exact=exact, **data), self._cnd_there()

@@ -96,6 +96,7 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
         return CND(ocp, policy, value, card)
     if method != "default":
         raise ValueError(f"train: method is {method!r}; expected 'default' or 'paper'")
+    ocp.check_strict("train")
     return _Training(ocp, dynamics, _expect(settings, TrainSettings), seed, out, progress).run()
 
 
