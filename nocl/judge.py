@@ -43,7 +43,7 @@ class Simulation:
     cost: Array  # [B], running + terminal, inf where it failed
     running_cost: Array  # [B], integral of L, exact (no penalty)
     terminal_cost: Array  # [B], G(x(T))
-    terminal_error: Array  # [B], ||x(T) - x*||_2
+    terminal_error: Array  # [B], ||x(T) - x*||_2, x* the nearest image of the goal (OCP.from_goal)
     control_magnitude: Array  # [B], mean of ||u||_2 over time
     saturation: Array  # [B], share of time with a control at a bound
     clearance: Array  # [B], min of all path constraints, at and between nodes; inf if the problem has none
@@ -305,7 +305,7 @@ class _Judge:
         x[~success, -1] = np.nan
         terminal = np.where(success, self.ocp.G(x[:, -1].T).full().ravel(), np.inf)
         running = np.where(success, running, np.inf)
-        error = np.where(success, np.linalg.norm(x[:, -1] - self.ocp.x_goal, axis=1), np.inf)
+        error = np.where(success, np.linalg.norm(self.ocp.from_goal(x[:, -1]), axis=1), np.inf)
         u[~np.isfinite(x).all(axis=2)] = np.nan
         return Simulation(t, x, u, running + terminal, running, terminal, error, np.where(success, magnitude, np.nan),
                           np.where(success, saturation, np.nan), clearance, success, message)

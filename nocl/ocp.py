@@ -22,6 +22,7 @@ from nocl.translate import instructions
 
 KINKS = ("solvers that use second derivatives may fail there; smooth it, nocl.smooth_abs(e, width) or "
          "nocl.smooth_max(a, b, width), or split a control, nocl.split_controls(system, names)")
+N_IMAGES, SAME_IMAGE = 16, 1e-9  # points of the box; relative to usual values, images that agree so far are one
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -140,6 +141,36 @@ class OCP:
         parts = {"the running cost": self.running, "the terminal cost": self.terminal,
                  **{f"path constraint {name!r}": h for name, h in self.path_constraints.items()}}
         return tuple(f"{what} has {kink}" for what, e in parts.items() for kink in kinks(e, z, lower, upper))
+
+    @cached_property
+    def periodic(self) -> tuple[int, ...]:
+        """The declared angles, by index, in which f, L, G and the constraints are 2 pi periodic: images are one state.
+
+        Found out by trying; none where the equations are not known.
+        """
+        s = self.system
+        if s.xdot is None:
+            return ()
+        rng = np.random.default_rng(0)
+        x, u = rng.uniform(s.lbx, s.ubx, (N_IMAGES, s.nx)).T, rng.uniform(s.lbu, s.ubu, (N_IMAGES, s.nu)).T
+        all_of = ca.Function("all", [s.x, s.u], [ca.vertcat(s.xdot, self.running, self.terminal,
+                                                            *self.path_constraints.values())])
+        here = all_of(x, u).full()
+        usual = np.abs(here).max(axis=1, keepdims=True)
+        turn = 2 * np.pi * np.eye(s.nx)
+        return tuple(i for i in s.angle_indices
+                     if (np.abs(all_of(x + turn[:, [i]], u).full() - here) <= SAME_IMAGE * usual).all())
+
+    def from_goal(self, x: Any) -> Any:
+        """x - x*, from the nearest image of the goal: numpy rows [..., nx], or a CasADi column [nx]."""
+        if not isinstance(x, (ca.SX, ca.MX)):
+            d = np.asarray(x, dtype=np.float64) - self.x_goal
+            for i in self.periodic:
+                d[..., i] -= 2 * np.pi * np.round(d[..., i] / (2 * np.pi))
+            return d
+        d = x - ca.DM(self.x_goal)
+        return ca.vertcat(*(ca.remainder(d[i], 2 * np.pi) if i in self.periodic else d[i] for i in range(d.numel()))) \
+            if self.periodic else d
 
     def check_strict(self, owner: str) -> None:
         """ValueError where the Hamiltonian is linear in a control, so that second derivatives say nothing of it."""

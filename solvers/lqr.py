@@ -1,8 +1,10 @@
 """LQR about the goal pair of an OCP: baseline, warm start, test oracle.
 
-With d = x - x* it is V = d' P d / 2 + const and u = u* - K d. With the Hessians Q, R, S of L and the Jacobians A, B of
-f at (x*, u*), K = R^-1 (B' P + S') and -dP/dt = Q + A' P + P A - K' R K, P(T) = the Hessian of G (Anderson, Moore
-(1990), "Optimal Control: Linear Quadratic Methods", ch. 2-3); on an infinite horizon dP/dt = 0.
+With d = x - x*, from the nearest image of the goal where the problem is periodic in an angle, it is
+V = d' P d / 2 + const and u = u* - K d. With the Hessians Q, R, S of L and the Jacobians A, B of f at (x*, u*),
+K = R^-1 (B' P + S') and -dP/dt = Q + A' P + P A - K' R K, P(T) = the Hessian of G (Anderson, Moore (1990), "Optimal
+Control: Linear Quadratic Methods", ch. 2-3); on an infinite horizon dP/dt = 0. K has the field's sign, u* - K d, where
+a Solution's gain is u_k + gain (x - x_k).
 """
 
 from __future__ import annotations
@@ -102,7 +104,7 @@ class LQR:
         """u [nu] or [B, nu], clipped to U."""
         s = self.ocp.system
         rows, single = checks.states(x, s.nx, s.name, "x")
-        u = np.clip(self.ocp.u_goal - (rows - self.ocp.x_goal) @ self.K(t).T, s.lbu, s.ubu)
+        u = np.clip(self.ocp.u_goal - self.ocp.from_goal(rows) @ self.K(t).T, s.lbu, s.ubu)
         return u[0] if single else u
 
     def value(self, x: ArrayLike, t: float = 0.0) -> Array | float:
@@ -111,7 +113,7 @@ class LQR:
         On an infinite horizon, what it costs beyond staying at the goal.
         """
         rows, single = checks.states(x, self.ocp.system.nx, self.ocp.system.name, "x")
-        d = rows - self.ocp.x_goal
+        d = self.ocp.from_goal(rows)
         rest = 0.0 if self.infinite else self._L_goal * (self.ocp.horizon - t) + self._G_goal
         V = np.einsum("bi,ij,bj->b", d, self.P(t), d) / 2 + rest
         return float(V[0]) if single else V
@@ -128,7 +130,7 @@ class LQR:
             P = ca.reshape(entries, n, n)
             P = (P + P.T) / 2
         K = ca.mtimes(ca.DM(np.linalg.inv(self.R)), ca.mtimes(self.B.T, P) + self.S.T)
-        u = self.ocp.u_goal - ca.mtimes(K, x - self.ocp.x_goal)
+        u = self.ocp.u_goal - ca.mtimes(K, self.ocp.from_goal(x))
         return ca.Function("policy", [x, t], [ca.fmin(ca.fmax(u, s.lbu), s.ubu)], ["x", "t"], ["u"])
 
 

@@ -78,7 +78,7 @@ def _lost_where(report: Results, m: int, b: int, i: int) -> str:
     ours, best = report.judged[m].simulation, report.judged[b].simulation
     running = float(ours.running_cost[i] - best.running_cost[i])
     terminal = float(ours.terminal_cost[i] - best.terminal_cost[i])
-    error = ours.x[i, -1] - report.ocp.x_goal
+    error = report.ocp.from_goal(ours.x[i, -1])
     k = int(np.abs(error).argmax())
     name = report.ocp.system.state_names[k]
     unit = report.ocp.system.units.get(name, "")

@@ -140,7 +140,7 @@ class Results:
                 "gap": float(self.gap[m, i]), "best_cost": float(self.best[i]), "best_method": self.best_method[i],
                 "predicted_cost": float(j.predicted[i]), "running_cost": float(s.running_cost[i]),
                 "terminal_cost": float(s.terminal_cost[i]), "terminal_error": float(s.terminal_error[i]),
-                "x_end": s.x[i, -1].tolist(), "error": (s.x[i, -1] - self.ocp.x_goal).tolist(),
+                "x_end": s.x[i, -1].tolist(), "error": self.ocp.from_goal(s.x[i, -1]).tolist(),
                 "control_magnitude": float(s.control_magnitude[i]),
                 "saturation": float(s.saturation[i]), "clearance": float(s.clearance[i]),
                 "ms_first": float(j.ms_first[i]), "solves": int(j.solves[i]),

@@ -92,7 +92,7 @@ def errors(report: Results) -> Table:
     s = report.ocp.system
     body = []
     for j in report.judged:
-        error = np.abs(j.simulation.x[:, -1] - report.ocp.x_goal)[np.asarray(j.simulation.success, dtype=bool)]
+        error = np.abs(report.ocp.from_goal(j.simulation.x[:, -1]))[np.asarray(j.simulation.success, dtype=bool)]
         if len(error):
             body.append([j.name, *(f"{number(np.median(e))}, {number(np.max(e))}" for e in error.T)])
     return Table("Terminal error of each coordinate", ["method", *map(s.unit, s.state_names)], body,

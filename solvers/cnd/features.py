@@ -2,7 +2,8 @@
 
 Features of (x, t): the state in units of its spread at that time about its mean at that time (both polynomials in t),
 sine and cosine of angles, time, the logarithm of the time to go, and the distance to the goal over the time to go: the
-optimal gain grows like 1 / (T - t).
+optimal gain grows like 1 / (T - t). Of an angle that the problem is periodic in nothing but sines and cosines is seen,
+so that all images of a state have one answer.
 """
 
 from __future__ import annotations
@@ -35,10 +36,14 @@ def features(ocp: OCP, x: Array, t: Array, dt: Array | None = None, *, plain: bo
     to_go = ca.fmax(ocp.horizon - time, 0)
     mean, spread = _moments_in_time(x, 2 * (t if dt is None else t + dt / 2) / ocp.horizon - 1)
     standard = (s.x - _polynomial(mean, tau)) / ca.exp(_polynomial(spread, tau))
+    once = [i for i in range(s.nx) if i not in ocp.periodic]  # the others have many images: sines and cosines only
     angles = [g(s.x[i]) for i in s.angle_indices for g in (ca.sin, ca.cos)]
-    rush = (s.x - ca.DM(ocp.x_goal)) / (to_go + LEAST_TIME * ocp.horizon)
+    off = s.x - ca.DM(ocp.x_goal)
+    left = ca.vertcat(*(ca.sin(off[i]) if i in ocp.periodic else off[i] for i in range(s.nx)))
+    rush = left / (to_go + LEAST_TIME * ocp.horizon)
     clock = ca.vertcat(tau, ca.log(to_go / ocp.horizon + LEAST_TIME) / 2)
-    raw = ca.vertcat(standard, *angles, clock, rush, s.x if plain else ca.SX(0, 1), *([] if dt is None else [held]))
+    more = [s.x[once]] if plain else []
+    raw = ca.vertcat(standard[once], *angles, clock, rush, *more, *([] if dt is None else [held]))
     given = [x, t] if dt is None else [x, t, dt]
     names, args = ["x", "t", "dt"][:len(given)], [s.x, start, held][:len(given)]
     some = slice(None, None, -(-len(t) // 20_000))  # of every kind of label
