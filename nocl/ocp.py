@@ -164,13 +164,14 @@ class OCP:
     def from_goal(self, x: Any) -> Any:
         """x - x*, from the nearest image of the goal: numpy rows [..., nx], or a CasADi column [nx]."""
         if not isinstance(x, (ca.SX, ca.MX)):
-            d = np.asarray(x, dtype=np.float64) - self.x_goal
+            rows = np.asarray(x, dtype=np.float64) - self.x_goal
             for i in self.periodic:
-                d[..., i] -= 2 * np.pi * np.round(d[..., i] / (2 * np.pi))
-            return d
-        d = x - ca.DM(self.x_goal)
-        return ca.vertcat(*(ca.remainder(d[i], 2 * np.pi) if i in self.periodic else d[i] for i in range(d.numel()))) \
-            if self.periodic else d
+                rows[..., i] -= 2 * np.pi * np.round(rows[..., i] / (2 * np.pi))
+            return rows
+        d: Any = x - ca.DM(self.x_goal)
+        for i in self.periodic:
+            d[i] = ca.remainder(d[i], 2 * np.pi)
+        return d
 
     def check_strict(self, owner: str) -> None:
         """ValueError where the Hamiltonian is linear in a control, so that second derivatives say nothing of it."""

@@ -162,7 +162,10 @@ def dask_cluster(folder):
     finally:
         for process in processes[::-1]:
             process.terminate()
-            process.wait(30)
+            try:
+                process.wait(10)
+            except subprocess.TimeoutExpired:  # a worker whose scheduler is gone goes on looking for it
+                process.kill()
 
 
 @pytest.mark.slow
@@ -193,3 +196,40 @@ def test_no_scheduler_is_one_clear_error(monkeypatch):
     nmpc, x0 = problem()
     with pytest.raises(ValueError, match=r"no Dask scheduler answers at tcp://127\.0\.0\.1:9"):
         nmpc.solve(x0[:2], workers="tcp://127.0.0.1:9")
+
+
+@pytest.mark.slow
+def test_a_cluster_without_workers_says_so_and_how_long_it_waited(tmp_path, monkeypatch):
+    monkeypatch.setattr(pools, "CONNECT", 2.0)
+    with dask_cluster(tmp_path) as (address, processes):
+        for worker in processes[1:]:
+            worker.terminate()
+            worker.wait(30)
+        with pytest.raises(ValueError, match=r"has no workers, and none joined within 2 s: start some with `dask wor"):
+            list(pools.Pool(address).outcomes(time.sleep, [np.float64(0.0)]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("lost", "match"), [(slice(1, 3), "all workers .* were lost"), (slice(0, 1), "was lost")])
+def test_a_cluster_that_is_lost_in_the_middle_is_one_clear_error(tmp_path, monkeypatch, lost, match):
+    monkeypatch.setattr(pools, "CONNECT", 3.0)
+    with dask_cluster(tmp_path) as (address, processes):
+        naps = [np.float64(seconds) for seconds in (*[0.0] * pools.CHUNK, *[60.0] * 8)]
+        outcomes = pools.Pool(address).outcomes(time.sleep, naps)
+        next(outcomes)
+        for process in processes[lost]:
+            process.kill()
+            process.wait(30)
+        with pytest.raises(ValueError, match=match):
+            list(outcomes)
+
+
+def own(task):
+    """A job of this file, which no worker can import."""
+    return task
+
+
+@pytest.mark.slow
+def test_a_worker_that_cannot_import_says_so(tmp_path):
+    with dask_cluster(tmp_path) as (address, _), pytest.raises(ValueError, match="cannot import what it needs"):
+        list(pools.Pool(address).outcomes(own, [np.float64(0.0)]))

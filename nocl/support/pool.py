@@ -7,10 +7,12 @@ A task has a name, unique in its run, a size (states), and `outcome(arrays)`, wh
 from __future__ import annotations
 
 import json
+import logging
 import os
 import pickle
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -19,13 +21,17 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from nocl.support.lock import alone
+
 Task = Any
 Outcome = Any
 CHUNK = 4  # tasks that a worker gets at a time, at most
 PROBE = 4  # tasks done here first, to measure what one costs
 START = 4.0  # seconds until the processes' first result, beyond building the solver
 WORTH = 4.0  # seconds that processes must save, by measurement
-CONNECT = 10.0  # seconds to wait for a scheduler
+CONNECT = 10.0  # seconds to wait for a scheduler, and for workers
+POLL = 0.02  # seconds between two looks at what is done
+LOOK = 1.0  # seconds between two looks at whether there still are workers
 MANIFEST, TASKS = "manifest.json", "tasks"
 
 
@@ -101,19 +107,78 @@ def _in_processes(k: int, job: Any, tasks: Sequence[Task]) -> Iterator[Outcome]:
 def _on_cluster(address: str, job: Any, tasks: Sequence[Task]) -> Iterator[Outcome]:
     """A task of a worker that dies is given to another by the scheduler; each outcome is taken once."""
     try:
-        from distributed import Client, as_completed
+        from distributed import Client
     except ImportError as error:
         raise ValueError(f"workers={address!r} needs Dask: pip install 'nocl[cluster]'") from error
+    with _connected(Client, address) as client:
+        data = pickle.dumps(job)  # with each chunk: scattered data would be lost with the worker that holds it
+        waiting = {client.submit(_unpacked, data, pickle.dumps(chunk), pure=False) for chunk in _chunks(tasks)}
+        while waiting:
+            done = _next_done(client, waiting, address)
+            waiting -= done
+            for future in done:
+                yield from _result(future, address)
+                future.release()
+
+
+@contextmanager
+def _connected(Client: Any, address: str) -> Iterator[Any]:
+    """A client of a scheduler that has workers; ValueError, in one line, where there are none, or they are lost."""
+    for name in ("client", "core", "utils"):  # their tracebacks say at length what the error here says in a line
+        logging.getLogger(f"distributed.{name}").setLevel(logging.CRITICAL)
     try:
         client = Client(address, timeout=CONNECT, set_as_default=False)
     except OSError as error:
-        raise ValueError(f"no Dask scheduler answers at {address}: {error}; start one with `dask scheduler`") from error
+        raise ValueError(f"no Dask scheduler answers at {address} within {CONNECT:g} s: {error}; start one with "
+                         "`dask scheduler`") from error
     with client:
-        data = pickle.dumps(job)  # with each chunk: scattered data would be lost with the worker that holds it
-        futures = [client.submit(_work, data, chunk, pure=False) for chunk in _chunks(tasks)]
-        for future in as_completed(futures, loop=client.loop):
-            yield from future.result()
-            future.release()
+        try:
+            client.wait_for_workers(1, timeout=CONNECT)
+        except TimeoutError:
+            raise ValueError(f"the Dask scheduler at {address} has no workers, and none joined within {CONNECT:g} s: "
+                             f"start some with `dask worker {address}`") from None
+        yield client
+
+
+def _next_done(client: Any, waiting: set[Any], address: str) -> set[Any]:
+    """Futures that are done, at least one; ValueError where scheduler or workers have been gone for CONNECT seconds."""
+    alone_since, looked = None, time.monotonic()
+    while not (done := {future for future in waiting if future.done()}):
+        time.sleep(POLL)
+        if time.monotonic() - looked < LOOK:
+            continue
+        looked = time.monotonic()
+        if client.status != "running":
+            raise ValueError(f"the Dask scheduler at {address} was lost; what was done is kept where `out` names a "
+                             "folder: start it again and repeat the call")
+        if client.scheduler_info(n_workers=-1)["workers"]:
+            alone_since = None
+            continue
+        alone_since = alone_since or time.monotonic()
+        if time.monotonic() - alone_since > CONNECT:
+            raise ValueError(f"all workers of the Dask scheduler at {address} were lost, and none came back within "
+                             f"{CONNECT:g} s; what was done is kept where `out` names a folder: start workers and "
+                             "repeat the call")
+    return done
+
+
+def _result(future: Any, address: str) -> list[Outcome]:
+    """What a worker made of a chunk; ValueError where it has no nocl, or the task was lost."""
+    try:
+        outcomes: list[Outcome] = future.result()
+    except Exception as error:
+        if isinstance(error, ImportError) or (isinstance(error, RuntimeError) and "deserialization" in str(error)):
+            raise ValueError(f"a Dask worker at {address} cannot import what it needs ({_said(error)}); install this "
+                             "version of nocl, and your own modules that it uses, where workers run") from None
+        if future.status in ("cancelled", "lost") or type(error).__module__.startswith("distributed"):
+            raise ValueError(f"the Dask cluster at {address} was lost: {_said(error)}; what was done is kept where "
+                             "`out` names a folder: start it again and repeat the call") from None
+        raise
+    return outcomes
+
+
+def _said(error: Exception) -> str:
+    return f"{type(error).__name__}: {' '.join(str(error).split())}"
 
 
 @lru_cache(maxsize=2)
@@ -124,6 +189,11 @@ def _job(data: bytes) -> Any:
 
 def _work(data: bytes, tasks: Sequence[Task]) -> list[Outcome]:
     return [_job(data)(task) for task in tasks]
+
+
+def _unpacked(data: bytes, tasks: bytes) -> list[Outcome]:
+    """Work whose tasks are unpickled by the worker: what it lacks for that is then said by the task, not by Dask."""
+    return _work(data, pickle.loads(tasks))
 
 
 @dataclass(frozen=True)
@@ -181,7 +251,16 @@ def _write(target: Path, content: bytes) -> None:
 
 
 def stream(job: Any, tasks: Sequence[Task], pool: Pool, journal: Journal, show: bool, what: str) -> Iterator[Outcome]:
-    """The outcome of each task, in any order: those of the journal first, the others done now and written at once."""
+    """The outcome of each task, in any order: those of the journal first, the others done now and written at once.
+
+    ValueError where another run is at work in the journal's folder.
+    """
+    with alone(journal.folder):
+        yield from _streamed(job, tasks, pool, journal, show, what)
+
+
+def _streamed(job: Any, tasks: Sequence[Task], pool: Pool, journal: Journal, show: bool,
+              what: str) -> Iterator[Outcome]:
     todo = [task for task in tasks if not journal.has(task)]
     left = {task.name for task in todo}
     total = sum(task.size for task in tasks)
