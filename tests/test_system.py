@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 
 import nocl
 from nocl import pretty
-from nocl.support import checks
 from nocl.systems import NAMES
 
 
@@ -255,10 +254,3 @@ def test_the_printed_text_means_the_expression(expression):
     (a_ + -3 * b_, "a - 3 b"), (ca.if_else(a_ > b_, a_, 0), "(a if b < a else 0)"), (2 * a_, "2 a")])
 def test_notation(expression, text):
     assert pretty.lines(expression, ca.vertcat(a_, b_, c_))[0] == [text]
-
-
-def test_copysign_is_refused_where_casadi_differentiates_it_wrongly(monkeypatch):
-    x, u = ca.SX.sym("x"), ca.SX.sym("u")
-    monkeypatch.setattr(checks, "COPYSIGN_WRONG", True)
-    with pytest.raises(ValueError, match=r"xdot contains copysign, which CasADi .* differentiates wrongly"):
-        nocl.System("s", x=x, u=u, xdot=ca.copysign(x, u), lbu=[-1], ubu=[1], lbx=[-1], ubx=[1])

@@ -88,10 +88,6 @@ def bounds(lower: ArrayLike, upper: ArrayLike, n: int, names: tuple[str, str], o
     return lb, ub
 
 
-# CasADi before 3.8.2 loses a sign when it differentiates copysign(x, y) at x < 0: no labels from it
-COPYSIGN_WRONG = tuple(int(n) for n in ca.CasadiMeta.version().split(".")[:3]) < (3, 8, 2)
-
-
 class FrozenSX(ca.SX):
     """An SX that cannot be edited in place; what is computed from it is plain SX."""
 
@@ -141,11 +137,6 @@ def symbols(value: Any, name: str, owner: str) -> list[ca.SX]:
     return parts
 
 
-def _uses(expression: ca.SX, operation: int) -> bool:
-    function = ca.Function("uses", ca.symvar(expression), [expression])
-    return any(function.instruction_id(k) == operation for k in range(function.n_instructions()))
-
-
 def expression(value: Any, rows: int, allowed: ca.SX, name: str, owner: str, controls: ca.SX | None = None) -> ca.SX:
     """A dense SX column of `rows` entries in the allowed symbols only; raises ValueError otherwise.
 
@@ -159,9 +150,6 @@ def expression(value: Any, rows: int, allowed: ca.SX, name: str, owner: str, con
     if value.shape != (rows, 1):
         raise ValueError(f"{owner}: {name} has shape {value.shape}, expected ({rows}, 1): "
                          f"{'one row per state, by ca.vertcat(...)' if rows > 1 else 'a scalar expression'}")
-    if COPYSIGN_WRONG and _uses(value, ca.OP_COPYSIGN):
-        raise ValueError(f"{owner}: {name} contains copysign, which CasADi {ca.CasadiMeta.version()} differentiates "
-                         f"wrongly: install CasADi 3.8.2 or later, or write it by if_else")
     free = [s for s in ca.symvar(value) if not ca.depends_on(s, allowed)]
     used = [s.name() for s in free if controls is not None and ca.depends_on(s, controls)]
     if used:
