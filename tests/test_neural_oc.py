@@ -264,7 +264,7 @@ def test_a_save_that_is_interrupted_leaves_the_former_file(trained, tmp_path, mo
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("nocl.support.store.os.replace", interrupt)
+    monkeypatch.setattr("nocl.support.atomic.os.replace", interrupt)
     with pytest.raises(KeyboardInterrupt):
         NeuralOC(trained.ocp, copy.deepcopy(trained.value_net), {"other": 1}).save(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == [path.name]

@@ -7,9 +7,7 @@ checkpoint/ what an interrupted stage goes on from; gone once it is finished
 
 from __future__ import annotations
 
-import hashlib
 import io
-import json
 import shutil
 import time
 from collections.abc import Sequence
@@ -26,7 +24,7 @@ from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.settings import TrainSettings
 from nocl.solvers.cnd.training import train
 from nocl.support import store
-from nocl.support.compiler import fingerprint
+from nocl.support.fingerprint import fingerprint, json_text, sha256
 from nocl.sysid.identification import LearnedDynamics, LogSettings, Settings, identify
 from nocl.sysid.logs.log import Log
 
@@ -76,7 +74,7 @@ class Stages:
     def identify_log(self, path: Path) -> LearnedDynamics:
         """The dynamics learned from a log, in dynamics/; their errors on a fifth of its recordings are shown first."""
         log = Log.read(path, self.ocp.system)
-        made_from, there = self._made_from(data=hashlib.sha256(path.read_bytes()).hexdigest()), self._dynamics_there()
+        made_from, there = self._made_from(data=sha256(path.read_bytes())), self._dynamics_there()
         if there is not None and there.card[KEY] == made_from:
             say(f"dynamics: taken from {self.folder / 'dynamics'} ({there.card['score']})")
             return there
@@ -144,13 +142,13 @@ class Stages:
         say(f"\n{report}\n\nreport: {path}")
 
     def _made_from(self, **settings: Any) -> dict[str, Any]:
-        problem = hashlib.sha256(json.dumps(self.ocp.to_data(), sort_keys=True).encode()).hexdigest()
+        problem = sha256(json_text(self.ocp.to_data()))  # as the cards of earlier runs have it
         return {"problem": problem, "seed": self.seed, "quick": self.quick, **settings}
 
     def _checkpoint(self, **settings: Any) -> Path:
         """Where outcomes so far are kept while a comparison lasts: another one goes elsewhere."""
-        key = json.dumps([self._made_from(**settings), __version__, version("casadi")], sort_keys=True)
-        return self.folder / "checkpoint" / f"compare-{hashlib.sha256(key.encode()).hexdigest()[:12]}"
+        key = fingerprint(self._made_from(**settings), __version__, version("casadi"))
+        return self.folder / "checkpoint" / f"compare-{key[:12]}"
 
     def _dynamics_there(self) -> LearnedDynamics | None:
         folder = self.folder / "dynamics"
@@ -271,8 +269,7 @@ def _solved(solver: Any, x0: np.ndarray[Any, np.dtype[np.float64]], seed: int, w
 
 
 def _solve_key(ocp: OCP, *settings: Any) -> str:
-    text = json.dumps([ocp.to_data(), *settings, __version__, version("casadi")], sort_keys=True)
-    return f"{settings[0]}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+    return f"{settings[0]}-{fingerprint(ocp.to_data(), settings, __version__, version('casadi'))[:12]}"
 
 
 def _write_arrays(path: Path, arrays: dict[str, Any]) -> Path:

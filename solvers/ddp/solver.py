@@ -10,7 +10,6 @@ differential dynamic programming, ICRA 2014.
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from collections import Counter
@@ -29,7 +28,7 @@ from nocl.solvers.ddp.kernel import ddp_source, pack_weights
 from nocl.solvers.ddp.without_compiler import ddp_kernel
 from nocl.support import checks
 from nocl.support.checks import Array
-from nocl.support.compiler import fingerprint
+from nocl.support.fingerprint import fingerprint
 from nocl.support.pool import Journal, Pool, stream
 
 if TYPE_CHECKING:
@@ -174,7 +173,7 @@ class DDP:
     def key(self) -> str:
         """A fingerprint of the problem, the model and the settings."""
         net = None if self.dynamics is None else self.dynamics.net
-        return fingerprint(json.dumps(self.ocp.to_data(), sort_keys=True), ddp_source(self.ocp, net), self._weights,
+        return fingerprint(self.ocp.to_data(), ddp_source(self.ocp, net), self._weights,
                            self.intervals, self.settings, version("nocl"))
 
     def _run_key(self, x0: Array, t0: Array, guess: dict[str, Array], curvature: bool) -> str:
