@@ -15,6 +15,7 @@ from nocl.exports import bundle
 from nocl.exports.c_code import load, to_c
 from nocl.solvers import NMPC
 from nocl.solvers.ddp.without_compiler import NumpyKernel
+from nocl.solvers.nmpc.solver import _program
 from nocl.support import compiler
 from nocl.translate.kernels import Kernel
 
@@ -147,8 +148,6 @@ def test_two_processes_repair_a_damaged_entry_at_once(tmp_path):
 
 
 def test_a_damaged_program_of_nmpc_is_built_again(tmp_path):
-    from nocl.solvers.nmpc import solver
-
     ocp, x0 = nocl.load_ocp("double_integrator"), [1.0, 0.0]
     first = NMPC(ocp, 9, starts=1, compiled=tmp_path).solve(x0)
     whole, = tmp_path.iterdir()
@@ -156,7 +155,7 @@ def test_a_damaged_program_of_nmpc_is_built_again(tmp_path):
     whole.rename(tmp_path / "aside")
     whole.write_bytes(content[:-9] + b"123456789")
     (tmp_path / "aside").unlink()
-    solver._program.cache_clear()  # as in another process
+    _program.cache_clear()  # as in another process
     assert NMPC(ocp, 9, starts=1, compiled=tmp_path).solve(x0).cost == first.cost
     assert [p.read_bytes() for p in tmp_path.iterdir()] == [content]
 

@@ -47,7 +47,8 @@ def test_equal_values_have_equal_ones_however_they_are_kept():
 
 def test_another_process_says_the_same():
     code = ("import numpy as np, casadi as ca; from nocl.support.fingerprint import fingerprint; "
-            "x = ca.SX.sym('x', 2); print(fingerprint({'a': [1.5, None], 'b': 'c'}, np.arange(3.0), ca.Function('f', [x], [ca.sin(x)])))")
+            "x = ca.SX.sym('x', 2); f = ca.Function('f', [x], [ca.sin(x)]); "
+            "print(fingerprint({'a': [1.5, None], 'b': 'c'}, np.arange(3.0), f))")
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     here = fingerprint({"b": "c", "a": [1.5, None]}, np.arange(3.0), ca.Function("f", [X], [ca.sin(X)]))
     assert out.stdout.strip() == here

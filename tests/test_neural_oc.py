@@ -295,8 +295,8 @@ def test_divergence_is_said():
 @pytest.mark.parametrize(("options", "message"), [
     ({"layers": 1}, "layers is 1; expected an integer >= 2"), ({"width": 0}, "width is 0"),
     ({"steps": 2.5}, r"steps is 2\.5"), ({"batch": True}, "batch is True"), ({"drop": 1.5}, "at most 1"),
-    ({"learning_rate": 0}, "learning_rate is 0; expected a number > 0"), ({"weights": (1, 1)}, "three numbers"),
-    ({"weights": (1, -1, 0)}, "three numbers"), ({"fused": 1}, "fused is 1; expected True or False")])
+    ({"learning_rate": 0}, "learning_rate is 0; expected a finite number > 0"), ({"weights": (1, 1)}, "3 numbers"),
+    ({"weights": (1, -1, 0)}, "3 numbers"), ({"fused": 1}, "fused is 1; expected True or False")])
 def test_settings_are_checked(options, message):
     with pytest.raises(ValueError, match=message):
         NeuralOCSettings(**options)

@@ -28,10 +28,6 @@ from nocl.support.fingerprint import fingerprint, json_text, sha256
 from nocl.sysid.identification import LearnedDynamics, LogSettings, Settings, identify
 from nocl.sysid.logs.log import Log
 
-QUICK_IDENTIFY = Settings(iterations=300, polish=10)
-QUICK_LOG = LogSettings(width=12, iterations=60, steps=3, window=20)
-QUICK_TRAIN = TrainSettings(seeds=6, starts=6, states=60, tails=300, visits=200, rounds=1, iterations=400,
-                            value_tails=400, value_visits=200, value_iterations=300, held_out=16)
 PARTS = ("dynamics", "cnd", "export", "report", "checkpoint")  # folders in a run's folder
 KEY = "run"  # of a card: what the stage was made from
 
@@ -43,7 +39,7 @@ class Stages:
     ocp: OCP
     folder: Path
     seed: int
-    quick: bool
+    effort: str = "normal"  # the word that scales all settings: "quick", "normal" or "best"
 
     def check(self, exact: bool) -> None:
         """ValueError where the folder holds something that is not a run's, before any work."""
@@ -63,7 +59,7 @@ class Stages:
         say(f"dynamics: learning f of {self.ocp.system.name}" + _anew(there))
         start = time.perf_counter()
         checkpoint = self.folder / "checkpoint" / "dynamics"
-        model = identify(self.ocp.system, seed=self.seed, settings=QUICK_IDENTIFY if self.quick else None,
+        model = identify(self.ocp.system, seed=self.seed, settings=Settings.of(self.effort),
                          checkpoint=checkpoint)
         model = replace(model, card={**model.card, KEY: made_from})
         model.save(self.folder / "dynamics")
@@ -79,7 +75,7 @@ class Stages:
             say(f"dynamics: taken from {self.folder / 'dynamics'} ({there.card['score']})")
             return there
         say(f"dynamics: {log!r}" + _anew(there))
-        settings = QUICK_LOG if self.quick else None
+        settings = LogSettings.of(self.effort)
         start = time.perf_counter()
         model = identify(self.ocp.system, data=log, seed=self.seed, settings=settings)
         if len({r.run for r in log}) > 1:
@@ -106,7 +102,7 @@ class Stages:
         say(f"controller: training on {'the exact' if exact else 'learned'} dynamics" + _anew(there))
         start = time.perf_counter()
         checkpoint = self.folder / "checkpoint" / "cnd"
-        cnd = train(self.ocp, model, seed=self.seed, settings=QUICK_TRAIN if self.quick else None, out=checkpoint)
+        cnd = train(self.ocp, model, seed=self.seed, settings=TrainSettings.of(self.effort), out=checkpoint)
         cnd.card[KEY] = made_from
         cnd.save(self.folder / "cnd")
         cnd.plot_training(self.folder / "cnd" / "training.png")
@@ -143,7 +139,7 @@ class Stages:
 
     def _made_from(self, **settings: Any) -> dict[str, Any]:
         problem = sha256(json_text(self.ocp.to_data()))  # as the cards of earlier runs have it
-        return {"problem": problem, "seed": self.seed, "quick": self.quick, **settings}
+        return {"problem": problem, "seed": self.seed, "effort": self.effort, **settings}
 
     def _checkpoint(self, **settings: Any) -> Path:
         """Where outcomes so far are kept while a comparison lasts: another one goes elsewhere."""
@@ -164,9 +160,12 @@ def _has_record(folder: Path) -> bool:
 
 
 def _ours(thing: Any, folder: Path) -> Any:
-    if KEY not in thing.card:
+    made_from = thing.card.get(KEY)
+    if made_from is None:
         raise ValueError(f"{folder} holds what `nocl run` did not make, and would be overwritten; expected a folder of "
                          "a run: name another --out")
+    if "quick" in made_from:  # of runs before there were three efforts
+        made_from["effort"] = "quick" if made_from.pop("quick") else "normal"
     return thing
 
 
