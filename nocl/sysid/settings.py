@@ -44,7 +44,9 @@ BY_SIZE = "by the number of its variables"
 class Settings(Scaled):
     """Of methods "default" and "mlp". None: by the number of a network's variables, as in Budget.of."""
 
-    EFFORT: ClassVar[Mapping[str, Mapping[str, Any]]] = {"quick": {"iterations": 300, "polish": 10}, "best": {"polish": 200}}
+    EFFORT: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "quick": {"iterations": 300, "polish": 10},
+        "best": {"polish": 200}}
 
     # where labels are fewer than two for each weight, networks are narrower than this, and polished for longer
     width: int | None = count(None, "of a network's two hidden layers", none=BY_SIZE)
