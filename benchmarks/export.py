@@ -32,6 +32,7 @@ from nocl.exports.onnx_writer import Session, to_onnx
 from nocl.nets import MLP, FeatureNet
 from nocl.solvers import NMPC
 from nocl.solvers.cnd import CND, pretrained
+from nocl.support import compiler
 
 BATCH = 10_000
 TIMER = """
@@ -113,13 +114,13 @@ def in_torch(net: FeatureNet, nx: int) -> dict[str, float]:
 
 
 def compiled(functions: dict[str, ca.Function], folder: Path) -> dict[str, ca.Function]:
-    """The same, by CasADi's code generation, gcc -O3 and ca.external."""
+    """The same, by CasADi's code generation, the C compiler's -O3 and ca.external."""
     generator = ca.CodeGenerator("all.c")
     for f in functions.values():
         generator.add(f)
     source = generator.generate(f"{folder}/")
     library = folder / "all.so"
-    subprocess.run(["gcc", "-O3", "-march=native", "-shared", "-fPIC", source, "-o", library, "-lm"], check=True)
+    compiler.run(["-O3", "-march=native", "-shared", "-fPIC", source, "-o", library, "-lm"], source)
     return {name: ca.external(name, str(library)) for name in functions}
 
 
@@ -131,7 +132,7 @@ def in_c(functions: dict[str, ca.Function], folder: Path, dtype: str, flags: tup
         calls = {"controller": 20000, "jacobian": 4000, "hessian": 500}[name]
         real = "double" if dtype == "float64" else "float"
         (folder / "timer.c").write_text(TIMER.format(name=name, calls=calls, nx=nx, n_out=n_out, real=real))
-        subprocess.run(["gcc", *flags, "timer.c", f"{name}.c", "-o", "timer", "-lm"], cwd=folder, check=True)
+        compiler.run([*flags, folder / "timer.c", folder / f"{name}.c", "-o", folder / "timer", "-lm"], "the timer")
         row[name] = float(subprocess.run(["./timer"], cwd=folder, capture_output=True, text=True, check=True).stdout)
     return row
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -20,7 +19,7 @@ from nocl.judge import Simulation, simulate
 from nocl.ocp import OCP
 from nocl.solvers.nmpc.loop import Loop
 from nocl.support.checks import Array
-from nocl.support.compiler import fingerprint
+from nocl.support.fingerprint import fingerprint
 from nocl.support.pool import Journal, Pool, do
 
 CALLS = 20  # control evaluations that are timed at each initial state, at most; the median counts
@@ -183,7 +182,7 @@ def key_of(job: Judging) -> str:
     """A fingerprint of all that outcomes depend on; plain callables are known by name."""
     d = job.disturbance
     arrays = [part for run in job.runs for part in run.identity] + [a for kick in d.kicks for a in kick]
-    return fingerprint(json.dumps(job.ocp.to_data(), sort_keys=True), job.x0, *arrays, list(job.delays), d.seed,
+    return fingerprint(job.ocp.to_data(), job.x0, *arrays, list(job.delays), d.seed,
                        "" if d.f is None else d.f, "" if d.noise is None else d.noise, version("nocl"),
                        version("casadi"))
 

@@ -36,6 +36,7 @@ from nocl.hamiltonian import minimiser
 from nocl.ocp import OCP
 from nocl.support import checks, store
 from nocl.support.checks import Array
+from nocl.support.fields import Checked, coefficients, count, flag, positive
 from nocl.support.threads import one_thread
 from nocl.translate.fused import FusedFunction
 from nocl.translate.rk4 import rk4
@@ -47,46 +48,22 @@ TERMS = ("running", "terminal", "hjb", "final", "gradient")  # of the loss, each
 
 
 @dataclass(frozen=True)
-class NeuralOCSettings:
+class NeuralOCSettings(Checked):
     """Settings of `train_neural_oc`; the defaults are those published for the quadcopter."""
 
-    width: int = 128  # of the ResNet
-    layers: int = 2  # of the ResNet: the opening one, and residual ones
-    rank: int = 10  # rows of A, at most nx + 1 of them
-    steps: int = 26  # of RK4 in a rollout
-    iterations: int = 6000  # of Adam
-    batch: int = 1024  # initial states, and as many held-out ones
-    learning_rate: float = 0.01
-    drop: float = 0.5  # factor of the learning rate ...
-    drop_every: int = 1200  # ... after so many iterations, which then go on from the best network so far
-    resample_every: int = 25  # iterations on the same initial states
-    check_every: int = 50  # iterations between looks at the held-out states; the best network is kept
-    weights: tuple[float, float, float] = (0.1, 0.0, 0.0)  # c_HJt, c_HJfin, c_HJgrad
-    fused: bool = True  # f, L, H and their gradients as compiled C; False: in torch, the same to rounding
-
-    def __post_init__(self) -> None:
-        least = dict.fromkeys(("width", "rank", "steps", "iterations", "batch", "drop_every", "resample_every",
-                               "check_every"), 1) | {"layers": 2}
-        for name, n in least.items():
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < n:
-                raise ValueError(f"NeuralOCSettings: {name} is {value!r}; expected an integer >= {n}")
-        for name in ("learning_rate", "drop"):
-            value = getattr(self, name)
-            if not _is_number(value) or value <= 0 or (name == "drop" and value > 1):
-                raise ValueError(f"NeuralOCSettings: {name} is {value!r}; expected a number > 0"
-                                 + (", at most 1, which is no drop" if name == "drop" else ""))
-        weights: Any = tuple(self.weights) if isinstance(self.weights, (tuple, list)) else (self.weights,)
-        if len(weights) != 3 or not all(_is_number(w) and w >= 0 for w in weights):
-            raise ValueError(f"NeuralOCSettings: weights is {weights}; expected three numbers >= 0, c_HJt, c_HJfin, "
-                             "c_HJgrad: published for the quadcopter are (0.1, 0, 0)")
-        object.__setattr__(self, "weights", weights)
-        if not isinstance(self.fused, bool):
-            raise ValueError(f"NeuralOCSettings: fused is {self.fused!r}; expected True or False")
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
+    width: int = count(128, "of the ResNet")
+    layers: int = count(2, "of the ResNet: the opening one, and residual ones", least=2)
+    rank: int = count(10, "rows of A, at most nx + 1 of them")
+    steps: int = count(26, "of RK4 in a rollout")
+    iterations: int = count(6000, "of Adam")
+    batch: int = count(1024, "initial states, and as many held-out ones")
+    learning_rate: float = positive(0.01, "of Adam")
+    drop: float = positive(0.5, "factor of the learning rate after `drop_every` iterations; 1: no drop", most=1)
+    drop_every: int = count(1200, "iterations, which then go on from the best network so far")
+    resample_every: int = count(25, "iterations on the same initial states")
+    check_every: int = count(50, "iterations between looks at the held-out states; the best network is kept")
+    weights: tuple[float, float, float] = coefficients((0.1, 0.0, 0.0), "c_HJt, c_HJfin, c_HJgrad")
+    fused: bool = flag(True, "f, L, H and their gradients as compiled C; False: in torch, the same to rounding")
 
 
 class ValueNet(nn.Module):

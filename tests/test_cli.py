@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import asdict
 
 import casadi as ca
 import numpy as np
@@ -247,8 +248,8 @@ SMALL = TrainSettings(seeds=3, starts=2, states=6, tails=30, visits=20, rounds=0
 
 
 def small(monkeypatch):
-    monkeypatch.setattr(run_folder, "QUICK_TRAIN", SMALL)
-    monkeypatch.setattr(run_folder, "QUICK_IDENTIFY", Settings(iterations=20, polish=2, samples=500))
+    monkeypatch.setattr(TrainSettings, "EFFORT", {"quick": asdict(SMALL)})
+    monkeypatch.setattr(Settings, "EFFORT", {"quick": {"iterations": 20, "polish": 2, "samples": 500}})
 
 
 RUN = ["run", "cubic.py", "--out", "out", "--quick", "--n", "2", "--intervals", "10"]

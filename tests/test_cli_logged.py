@@ -6,7 +6,6 @@ import pytest
 from scipy.linalg import expm
 
 import nocl
-from nocl.cli import run_folder
 from nocl.cli.commands import main
 from nocl.judge import simulate
 from nocl.solvers.cnd import CND, TrainSettings
@@ -27,10 +26,10 @@ EXACT = "ca.vertcat(v, -4 * p - 0.4 * v + u)"
 def here(tmp_path, monkeypatch):
     """plant.py without equations, exact.py with them, log.csv: five recordings under random held controls."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(run_folder, "QUICK_LOG", LogSettings(width=6, iterations=40, steps=4, window=20))
-    monkeypatch.setattr(run_folder, "QUICK_TRAIN", TrainSettings(
-        seeds=2, starts=2, states=12, tails=60, visits=40, rounds=1, iterations=80, value_initial=10, value_tails=60,
-        value_visits=40, value_iterations=40, held_out=4))
+    monkeypatch.setattr(LogSettings, "EFFORT", {"quick": {"width": 6, "iterations": 40, "steps": 4, "window": 20}})
+    monkeypatch.setattr(TrainSettings, "EFFORT", {"quick": {
+        "seeds": 2, "starts": 2, "states": 12, "tails": 60, "visits": 40, "rounds": 1, "iterations": 80,
+        "value_initial": 10, "value_tails": 60, "value_visits": 40, "value_iterations": 40, "held_out": 4}})
     (tmp_path / "plant.py").write_text(PLANT.format(xdot=None))
     (tmp_path / "exact.py").write_text(PLANT.format(xdot=EXACT))
     rng, h = np.random.default_rng(0), 0.05

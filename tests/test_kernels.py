@@ -8,6 +8,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from nocl.support import compiler
 from nocl.translate import kernels
 from nocl.translate.instructions import instructions
 from nocl.translate.kernels import Kernel, emit
@@ -134,7 +135,7 @@ def test_one_source_is_one_file_in_the_named_folder(tmp_path, monkeypatch):
     assert [p.suffix for p in written] == [".so"]
     Kernel(source([A + 1]), named)
     assert len(list(named.iterdir())) == 2
-    monkeypatch.setenv(kernels.CACHE_VARIABLE, str(other))
+    monkeypatch.setenv(compiler.CACHE_VARIABLE, str(other))
     Kernel(source([A]))
     assert len(list(other.iterdir())) == 1
 
@@ -152,8 +153,8 @@ def test_two_processes_may_build_at_once(tmp_path):
 
 
 def test_without_a_cache_nothing_stays(tmp_path):
-    script = ("from tests.test_kernels import *\nfrom nocl.translate.kernels import _own_folder\n"
-              "Kernel(source([A])); print(_own_folder().name)")
+    script = ("from tests.test_kernels import *\nfrom nocl.support.compiler import own_folder\n"
+              "Kernel(source([A])); print(own_folder())")
     root = Path(__file__).resolve().parents[1]
     out = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True, cwd=root)
     assert not Path(out.stdout.strip()).exists()

@@ -264,7 +264,7 @@ def test_a_save_that_is_interrupted_leaves_the_former_file(trained, tmp_path, mo
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("nocl.support.store.os.replace", interrupt)
+    monkeypatch.setattr("nocl.support.atomic.os.replace", interrupt)
     with pytest.raises(KeyboardInterrupt):
         NeuralOC(trained.ocp, copy.deepcopy(trained.value_net), {"other": 1}).save(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
@@ -295,8 +295,8 @@ def test_divergence_is_said():
 @pytest.mark.parametrize(("options", "message"), [
     ({"layers": 1}, "layers is 1; expected an integer >= 2"), ({"width": 0}, "width is 0"),
     ({"steps": 2.5}, r"steps is 2\.5"), ({"batch": True}, "batch is True"), ({"drop": 1.5}, "at most 1"),
-    ({"learning_rate": 0}, "learning_rate is 0; expected a number > 0"), ({"weights": (1, 1)}, "three numbers"),
-    ({"weights": (1, -1, 0)}, "three numbers"), ({"fused": 1}, "fused is 1; expected True or False")])
+    ({"learning_rate": 0}, "learning_rate is 0; expected a finite number > 0"), ({"weights": (1, 1)}, "3 numbers"),
+    ({"weights": (1, -1, 0)}, "3 numbers"), ({"fused": 1}, "fused is 1; expected True or False")])
 def test_settings_are_checked(options, message):
     with pytest.raises(ValueError, match=message):
         NeuralOCSettings(**options)

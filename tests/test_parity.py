@@ -137,8 +137,6 @@ def test_what_load_refuses(exported, tmp_path):
         load(folder / "c")
     with pytest.raises(ValueError, match="no function of to_c"):
         load(tmp_path)
-    with pytest.raises(ValueError, match="'no-such-cc' cannot be run"):
-        load(folder / "c", "cartpole_policy", compiler="no-such-cc")
     law = load(folder / "c", "cartpole_policy")
     with pytest.raises(ValueError, match=r"shape \(3,\); expected \[4\]"):
         law(np.zeros(3), 0.0)

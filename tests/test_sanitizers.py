@@ -12,7 +12,7 @@ import pytest
 
 import nocl
 from nocl.solvers.ddp.solver import DDP
-from nocl.translate.kernels import CACHE_VARIABLE
+from nocl.support.compiler import CACHE_VARIABLE
 
 ROOT = Path(__file__).resolve().parents[1]
 SANITIZERS = "-fsanitize=address,undefined -fno-sanitize-recover=all -g1"
@@ -20,13 +20,13 @@ SCRIPT = """
 import sys
 import numpy as np
 import nocl
-from nocl.solvers import ddp_kernel
-from nocl.solvers.ddp import DDP, DDPSettings
+from nocl.solvers.ddp import kernel
+from nocl.solvers.ddp.solver import DDP, DDPSettings
 from tests.test_ddp import random_model
 cache, name, kind = sys.argv[1:]
 ocp = nocl.load_ocp(name)
 if kind == "looped":
-    ddp_kernel.STRAIGHT = 0
+    kernel.STRAIGHT = 0
 d = DDP(ocp, intervals=7, dynamics=random_model(name) if kind == "learned" else None, threads=2, cache=cache,
         settings=DDPSettings(max_iterations=4))
 W = d._kernel.width
@@ -40,7 +40,7 @@ print("clean")
 VALUE = """
 import itertools, torch
 from nocl.nets import MLP
-from nocl.solvers.cnd.value_kernel import ValueKernel
+from nocl.solvers.cnd.loss_kernel import ValueKernel
 for sizes, nx, dtype in itertools.product(([3, 5, 4], [7, 17, 16, 3]), (1, 4), (torch.float32, torch.float64)):
     torch.manual_seed(0)
     mlp, n, nz = MLP(sizes, "tanh", skip=True).to(dtype), 37, sizes[0]
@@ -55,7 +55,7 @@ print("clean")
 BROKEN = """
 import ctypes, sys
 import numpy as np
-from nocl.kernels import Kernel
+from nocl.translate.kernels import Kernel
 k = Kernel('#include "lanes.h"\\nvoid run(int64_t first, int64_t last, const int64_t *index, double *x) '
            '{ int64_t three[3] = {first}; x[0] = three[last + 5]; }', sys.argv[1])
 k("run", np.arange(1), np.zeros(1))

@@ -19,7 +19,7 @@ from nocl.comparisons.report.findings import Loss, quantiles
 from nocl.comparisons.report.tables import tables
 from nocl.comparisons.stability import local, stability
 from nocl.solvers import LQR, NMPC
-from nocl.support.compiler import fingerprint
+from nocl.support.fingerprint import fingerprint
 from nocl.systems import double_integrator, dubins
 
 

@@ -299,11 +299,11 @@ def test_nothing_is_written_without_out(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(("change", "message"), [
-    ({"seeds": 0}, "seeds is 0; expected a whole number of at least 1"),
+    ({"seeds": 0}, "seeds is 0; expected an integer >= 1"),
     ({"iterations": 2.5}, "iterations is 2.5"), ({"batch": True}, "batch is True"),
-    ({"lr": 0.0}, "lr is 0.0; expected a positive number"), ({"width": -1.0}, "width is -1.0"),
+    ({"lr": 0.0}, "lr is 0.0; expected a finite number > 0"), ({"width": -1.0}, "width is -1.0"),
     ({"kick": float("nan")}, "kick is nan"), ({"gap_p95": float("inf")}, "gap_p95 is inf"),
-    ({"rounds": -1}, "at least 0"), ({"hidden": ()}, r"hidden is \(\)"), ({"hidden": (64, 0)}, "expected widths")])
+    ({"rounds": -1}, ">= 0"), ({"hidden": ()}, r"hidden is \(\)"), ({"hidden": (64, 0)}, "expected widths")])
 def test_settings_are_checked(change, message):
     with pytest.raises(ValueError, match=message):
         TrainSettings(**change)

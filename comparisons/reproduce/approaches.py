@@ -24,7 +24,7 @@ from nocl.comparisons.reproduce.dubins import rollout_ms
 from nocl.ocp import OCP
 from nocl.support import store
 from nocl.support.checks import Array
-from nocl.support.compiler import fingerprint
+from nocl.support.fingerprint import fingerprint
 from nocl.systems import load_ocp
 
 PROBLEMS = ("double_integrator", "pendulum", "dubins", "cartpole", "acrobot", "quadrotor")

@@ -30,7 +30,7 @@ from nocl.ocp import OCP
 from nocl.solvers.nmpc.loop import Loop
 from nocl.support import store
 from nocl.support.checks import Array
-from nocl.support.compiler import fingerprint
+from nocl.support.fingerprint import fingerprint
 from nocl.systems import load_ocp, quadrotor
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ from nocl.judge import Simulation, simulate
 from nocl.ocp import OCP
 from nocl.support import store
 from nocl.support.checks import Array
-from nocl.support.compiler import fingerprint
+from nocl.support.fingerprint import fingerprint
 from nocl.systems import load_ocp
 from nocl.translate.rk4 import rk4
 

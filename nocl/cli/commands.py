@@ -10,6 +10,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from nocl.support.fields import EFFORTS
+
 if TYPE_CHECKING:
     from nocl.ocp import OCP
 
@@ -77,13 +79,13 @@ def parser() -> argparse.ArgumentParser:
 
     command("list", _list, "the problems that come with nocl")
     sub = command("run", _run, "identify, train, export, solve by NMPC, compare and report, in one go")
-    _add(sub, "problem", "out", "seed", "n", "exact", "quick", "intervals", "methods")
+    _add(sub, "problem", "out", "seed", "n", "exact", "effort", "quick", "intervals", "methods")
     sub = command("identify", _identify, "learn the dynamics, from the equations or from logged trajectories")
-    _add(sub, "problem", "out", "seed", "quick")
+    _add(sub, "problem", "out", "seed", "effort", "quick")
     sub.add_argument("--data", type=Path, metavar="LOG", help="a .csv or .parquet file with columns t, states, "
                      "controls, and run: learn from it alone, test on a fifth of its runs")
     sub = command("train", _train, "train a controller and a value function, on learned dynamics unless --exact")
-    _add(sub, "problem", "out", "seed", "exact", "quick")
+    _add(sub, "problem", "out", "seed", "exact", "effort", "quick")
     sub = command("solve", _solve, "solve the problem from many initial states")
     _add(sub, "problem", "out", "seed", "n", "intervals")
     sub.add_argument("--solver", choices=SOLVERS, default="nmpc", help="default: nmpc")
@@ -169,7 +171,11 @@ def _add(sub: argparse.ArgumentParser, *names: str) -> None:
         "seed": ("--seed", {"type": _seed, "default": 0, "help": "of all that is drawn; default: 0"}),
         "n": ("--n", {"type": _count, "default": 100, "help": "number of initial states; default: 100"}),
         "exact": ("--exact", {"action": "store_true", "help": "train on the exact dynamics, not on learned ones"}),
-        "quick": ("--quick", {"action": "store_true", "help": "small budgets: to see whether it works, not how well"}),
+        "effort": ("--effort", {"choices": EFFORTS, "default": "normal", "help": "quick: to see whether it works, not "
+                                "how well; best: what gave the best results, in several times the time; default: "
+                                "normal"}),
+        "quick": ("--quick", {"dest": "effort", "action": "store_const", "const": "quick",
+                              "default": argparse.SUPPRESS, "help": "the same as --effort quick"}),
         "intervals": ("--intervals", {"type": _count, "default": 80, "metavar": "N",
                                       "help": "of NMPC and DDP; default: 80"}),
         "methods": ("--methods", {"type": _methods, "default": ("CND", "NMPC"), "metavar": "A,B",
@@ -348,7 +354,7 @@ def _run(args: argparse.Namespace) -> None:
     from nocl.cli.run_folder import Stages
 
     ocp, out = _problem(args)
-    stages = Stages(ocp, out, args.seed, args.quick)
+    stages = Stages(ocp, out, args.seed, args.effort)
     stages.check(exact=args.exact)
     _other_methods(ocp, args.methods, args.intervals)
     cnd = stages.train(exact=args.exact)
@@ -372,7 +378,7 @@ def _identify(args: argparse.Namespace) -> None:
     from nocl.cli.run_folder import Stages
 
     ocp, out = _problem(args)
-    stages = Stages(ocp, out, args.seed, args.quick)
+    stages = Stages(ocp, out, args.seed, args.effort)
     stages.check(exact=False)
     if args.data is None:
         stages.identify()
@@ -384,7 +390,7 @@ def _train(args: argparse.Namespace) -> None:
     from nocl.cli.run_folder import Stages
 
     ocp, out = _problem(args)
-    stages = Stages(ocp, out, args.seed, args.quick)
+    stages = Stages(ocp, out, args.seed, args.effort)
     stages.check(exact=args.exact)
     stages.train(exact=args.exact)
 
@@ -403,7 +409,7 @@ def _export(args: argparse.Namespace) -> None:
     cnd = load_run(run)
     out = args.out if args.out is not None else run / "export"
     _check_out(out)
-    Stages(cnd.ocp, run, 0, False).export(cnd, out, tuple(dict.fromkeys(args.to or ("casadi", "c"))), args.against)
+    Stages(cnd.ocp, run, 0).export(cnd, out, tuple(dict.fromkeys(args.to or ("casadi", "c"))), args.against)
 
 
 def _compare(args: argparse.Namespace) -> None:
@@ -415,7 +421,7 @@ def _compare(args: argparse.Namespace) -> None:
     _check_out(out)
     _other_methods(cnd.ocp, args.methods, args.intervals)
     seed = int(cnd.card.get("seed", 0)) if args.seed is None else args.seed
-    Stages(cnd.ocp, run, seed, False).compare(cnd, out, args.methods, args.n, args.intervals, args.hold, args.robust)
+    Stages(cnd.ocp, run, seed).compare(cnd, out, args.methods, args.n, args.intervals, args.hold, args.robust)
 
 
 def _other_methods(ocp: OCP, methods: Sequence[str], intervals: int) -> None:

@@ -7,9 +7,7 @@ checkpoint/ what an interrupted stage goes on from; gone once it is finished
 
 from __future__ import annotations
 
-import hashlib
 import io
-import json
 import shutil
 import time
 from collections.abc import Sequence
@@ -26,14 +24,10 @@ from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.settings import TrainSettings
 from nocl.solvers.cnd.training import train
 from nocl.support import store
-from nocl.support.compiler import fingerprint
+from nocl.support.fingerprint import fingerprint, json_text, sha256
 from nocl.sysid.identification import LearnedDynamics, LogSettings, Settings, identify
 from nocl.sysid.logs.log import Log
 
-QUICK_IDENTIFY = Settings(iterations=300, polish=10)
-QUICK_LOG = LogSettings(width=12, iterations=60, steps=3, window=20)
-QUICK_TRAIN = TrainSettings(seeds=6, starts=6, states=60, tails=300, visits=200, rounds=1, iterations=400,
-                            value_tails=400, value_visits=200, value_iterations=300, held_out=16)
 PARTS = ("dynamics", "cnd", "export", "report", "checkpoint")  # folders in a run's folder
 KEY = "run"  # of a card: what the stage was made from
 
@@ -45,7 +39,7 @@ class Stages:
     ocp: OCP
     folder: Path
     seed: int
-    quick: bool
+    effort: str = "normal"  # the word that scales all settings: "quick", "normal" or "best"
 
     def check(self, exact: bool) -> None:
         """ValueError where the folder holds something that is not a run's, before any work."""
@@ -65,7 +59,7 @@ class Stages:
         say(f"dynamics: learning f of {self.ocp.system.name}" + _anew(there))
         start = time.perf_counter()
         checkpoint = self.folder / "checkpoint" / "dynamics"
-        model = identify(self.ocp.system, seed=self.seed, settings=QUICK_IDENTIFY if self.quick else None,
+        model = identify(self.ocp.system, seed=self.seed, settings=Settings.of(self.effort),
                          checkpoint=checkpoint)
         model = replace(model, card={**model.card, KEY: made_from})
         model.save(self.folder / "dynamics")
@@ -76,12 +70,12 @@ class Stages:
     def identify_log(self, path: Path) -> LearnedDynamics:
         """The dynamics learned from a log, in dynamics/; their errors on a fifth of its recordings are shown first."""
         log = Log.read(path, self.ocp.system)
-        made_from, there = self._made_from(data=hashlib.sha256(path.read_bytes()).hexdigest()), self._dynamics_there()
+        made_from, there = self._made_from(data=sha256(path.read_bytes())), self._dynamics_there()
         if there is not None and there.card[KEY] == made_from:
             say(f"dynamics: taken from {self.folder / 'dynamics'} ({there.card['score']})")
             return there
         say(f"dynamics: {log!r}" + _anew(there))
-        settings = QUICK_LOG if self.quick else None
+        settings = LogSettings.of(self.effort)
         start = time.perf_counter()
         model = identify(self.ocp.system, data=log, seed=self.seed, settings=settings)
         if len({r.run for r in log}) > 1:
@@ -108,7 +102,7 @@ class Stages:
         say(f"controller: training on {'the exact' if exact else 'learned'} dynamics" + _anew(there))
         start = time.perf_counter()
         checkpoint = self.folder / "checkpoint" / "cnd"
-        cnd = train(self.ocp, model, seed=self.seed, settings=QUICK_TRAIN if self.quick else None, out=checkpoint)
+        cnd = train(self.ocp, model, seed=self.seed, settings=TrainSettings.of(self.effort), out=checkpoint)
         cnd.card[KEY] = made_from
         cnd.save(self.folder / "cnd")
         cnd.plot_training(self.folder / "cnd" / "training.png")
@@ -144,13 +138,13 @@ class Stages:
         say(f"\n{report}\n\nreport: {path}")
 
     def _made_from(self, **settings: Any) -> dict[str, Any]:
-        problem = hashlib.sha256(json.dumps(self.ocp.to_data(), sort_keys=True).encode()).hexdigest()
-        return {"problem": problem, "seed": self.seed, "quick": self.quick, **settings}
+        problem = sha256(json_text(self.ocp.to_data()))  # as the cards of earlier runs have it
+        return {"problem": problem, "seed": self.seed, "effort": self.effort, **settings}
 
     def _checkpoint(self, **settings: Any) -> Path:
         """Where outcomes so far are kept while a comparison lasts: another one goes elsewhere."""
-        key = json.dumps([self._made_from(**settings), __version__, version("casadi")], sort_keys=True)
-        return self.folder / "checkpoint" / f"compare-{hashlib.sha256(key.encode()).hexdigest()[:12]}"
+        key = fingerprint(self._made_from(**settings), __version__, version("casadi"))
+        return self.folder / "checkpoint" / f"compare-{key[:12]}"
 
     def _dynamics_there(self) -> LearnedDynamics | None:
         folder = self.folder / "dynamics"
@@ -166,9 +160,12 @@ def _has_record(folder: Path) -> bool:
 
 
 def _ours(thing: Any, folder: Path) -> Any:
-    if KEY not in thing.card:
+    made_from = thing.card.get(KEY)
+    if made_from is None:
         raise ValueError(f"{folder} holds what `nocl run` did not make, and would be overwritten; expected a folder of "
                          "a run: name another --out")
+    if "quick" in made_from:  # of runs before there were three efforts
+        made_from["effort"] = "quick" if made_from.pop("quick") else "normal"
     return thing
 
 
@@ -271,8 +268,7 @@ def _solved(solver: Any, x0: np.ndarray[Any, np.dtype[np.float64]], seed: int, w
 
 
 def _solve_key(ocp: OCP, *settings: Any) -> str:
-    text = json.dumps([ocp.to_data(), *settings, __version__, version("casadi")], sort_keys=True)
-    return f"{settings[0]}-{hashlib.sha256(text.encode()).hexdigest()[:12]}"
+    return f"{settings[0]}-{fingerprint(ocp.to_data(), settings, __version__, version('casadi'))[:12]}"
 
 
 def _write_arrays(path: Path, arrays: dict[str, Any]) -> Path:

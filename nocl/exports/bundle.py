@@ -16,7 +16,7 @@ import numpy as np
 from nocl.exports import parity
 from nocl.exports.casadi_forms import to_casadi
 from nocl.exports.parity import Certificate, Finding, Part
-from nocl.support import store
+from nocl.support import compiler, store
 from nocl.support.checks import Array
 from nocl.system import System
 
@@ -101,7 +101,11 @@ def _missing() -> dict[str, str]:
     """The forms that cannot be made here, with what they need."""
     missing = {form: f"the package(s) {', '.join(absent)}: pip install \"nocl[{form}]\"" for form, packages in
                NEEDS.items() if (absent := [p for p in packages if find_spec(p) is None])}
-    return missing if shutil.which("cc") else missing | {"c": "a C compiler, cc: install gcc"}
+    try:
+        compiler.command()
+    except compiler.NoCompilerError as error:
+        missing["c"] = f"a C compiler: {error}"
+    return missing
 
 
 def _folder(folder: Path) -> Path:

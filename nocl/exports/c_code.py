@@ -19,7 +19,6 @@ import ctypes
 import os
 import re
 import shutil
-import subprocess
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -31,7 +30,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nocl.support import checks
+from nocl.support import checks, compiler
 from nocl.support.checks import Array
 
 MARK = "written by nocl.to_c"  # stands in the first line of every file: only such files are overwritten
@@ -130,7 +129,7 @@ class Compiled:
         self.inputs = {k: n for k, n in lengths.items() if k not in self.outputs}
         self.dtype = "float64" if declared[0][0].split()[-1] == "double" else "float32"
         real = ctypes.c_double if self.dtype == "float64" else ctypes.c_float
-        self.function = getattr(ctypes.CDLL(str(library)), self.name)
+        self.function = getattr(compiler.load(library), self.name)
         self.function.restype = ctypes.c_int
         self.function.argtypes = [ctypes.c_void_p if k.startswith("*") else real for _, k in declared]
         self._scalar = [not k.startswith("*") for _, k in declared][:len(self.inputs)]
@@ -163,12 +162,11 @@ class Compiled:
         return np.ascontiguousarray(rows, self.dtype)
 
 
-def load(folder: str | Path, name: str | None = None, *, compiler: str = "cc",
-         flags: Sequence[str] = ("-O2", "-std=c99")) -> Compiled:
+def load(folder: str | Path, name: str | None = None, *, flags: Sequence[str] = ("-O2", "-std=c99")) -> Compiled:
     """The function that to_c wrote in `folder`, compiled and loaded by ctypes; nothing is written to the folder.
 
-    name: which one, where the folder holds several. Raises ValueError for a missing compiler, a folder without such a
-    function, and code that does not compile.
+    name: which one, where the folder holds several. The compiler is $CC, or else gcc or cc. Raises ValueError for a
+    missing compiler, a folder without such a function, and code that does not compile.
     """
     folder = Path(folder)
     there = {p.stem: p for p in sorted(folder.glob("*.h")) if (folder / f"{p.stem}_casadi.c").is_file()}
@@ -177,16 +175,13 @@ def load(folder: str | Path, name: str | None = None, *, compiler: str = "cc",
     if name is None or name not in there:
         raise ValueError(f"to_c.load: {folder} holds {', '.join(there) or 'no function of to_c'}; got name={name!r}: "
                          "name one of them")
-    with tempfile.TemporaryDirectory(prefix="nocl_c_") as build:  # a loaded library needs its file no longer
+    source = folder / f"{name}.c"
+    with tempfile.TemporaryDirectory(dir=compiler.own_folder()) as build:  # a loaded library needs its file no longer
         library = Path(build) / f"{name}.so"
-        command = [compiler, *flags, "-shared", "-fPIC", str(folder / f"{name}.c"), "-o", str(library), "-lm"]
         try:
-            result = subprocess.run(command, capture_output=True, text=True, check=False)
-        except OSError as error:
-            raise ValueError(f"to_c.load: the compiler {compiler!r} cannot be run ({error.strerror}): install gcc, or "
-                             "pass another `compiler`") from error
-        if result.returncode:
-            raise ValueError(f"to_c.load: {compiler} refuses {folder / f'{name}.c'}: {result.stderr.strip()[-500:]}")
+            compiler.run([*flags, "-shared", "-fPIC", source, "-o", library, "-lm"], f"{source}")
+        except compiler.CompilerError as error:
+            raise ValueError(f"to_c.load: {error}; expected the code that to_c wrote: write it again") from error
         return Compiled(there[name], library)
 
 

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import atexit
 import copy
 import re
-import shutil
-import subprocess
 import tempfile
 import uuid
 import warnings
@@ -22,6 +19,7 @@ import torch
 from torch import Tensor, nn
 
 from nocl.nets import FeatureNet
+from nocl.support import compiler
 
 TOLERANCE = 1e-4  # relative; float32 keeps 1e-6 or so on well scaled networks
 
@@ -73,11 +71,9 @@ def _import() -> ModuleType:
 
 
 def _folder(build_dir: str | Path | None) -> Path:
-    """The build folder, absolute; without one, a temporary folder that is removed at exit."""
+    """The build folder, absolute; without one, one that goes with the process."""
     if build_dir is None:
-        folder = Path(tempfile.mkdtemp(prefix="nocl_l4casadi_"))
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
-        return folder
+        return Path(tempfile.mkdtemp(prefix="l4casadi-", dir=compiler.own_folder()))
     folder = Path(build_dir).absolute()
     if re.search(r'["\\\n]', str(folder)):
         raise ValueError(f"build_dir is {str(folder)!r}; expected a path without quotes, backslashes and line breaks, "
@@ -92,7 +88,7 @@ def _folder(build_dir: str | Path | None) -> Path:
 def _compiled(library: Any, rows: nn.Module, folder: Path, unique: str, n: int) -> Any:
     class Quiet(library.L4CasADi):  # type: ignore[misc]
         def compile(self) -> None:  # its own goes through a shell, where a path with a blank falls apart
-            _gcc(library, folder, unique)
+            _compile(library, folder, unique)
 
     # jac_jac gives exact Hessians inside an NLP; with the adjoint ones present CasADi asks for more than there is
     model = Quiet(rows, name=unique, build_dir=str(folder), generate_adj1=False, generate_jac_adj1=False,
@@ -115,18 +111,15 @@ def _compiled(library: Any, rows: nn.Module, folder: Path, unique: str, n: int) 
     return model._cs_fun
 
 
-def _gcc(library: Any, folder: Path, unique: str) -> None:
+def _compile(library: Any, folder: Path, unique: str) -> None:
     package = Path(library.__file__).parent
-    command = ["gcc", "-fPIC", "-shared", str(folder / f"{unique}.cpp"), "-o", str(folder / f"lib{unique}.so"),
+    arguments = ["-fPIC", "-shared", str(folder / f"{unique}.cpp"), "-o", str(folder / f"lib{unique}.so"),
                f"-I{package / 'include'}", f"-L{package / 'lib'}", f"-Wl,-soname,lib{unique}.so", "-ll4casadi",
                "-lstdc++", "-std=c++17", f"-D_GLIBCXX_USE_CXX11_ABI={int(torch._C._GLIBCXX_USE_CXX11_ABI)}"]
     try:
-        result = subprocess.run(command, capture_output=True, text=True, check=False)
-    except OSError as error:
-        raise ValueError(f"to_casadi: L4CasADi needs gcc, which cannot be run ({error.strerror}): install gcc "
-                         "and g++") from error
-    if result.returncode:
-        raise ValueError(f"to_casadi: gcc cannot compile what L4CasADi wrote: {result.stderr.strip()[-500:]}")
+        compiler.run(arguments, "what L4CasADi wrote")
+    except compiler.CompilerError as error:
+        raise ValueError(f"to_casadi: {error}; expected a C++ compiler too: install g++") from error
 
 
 @contextmanager

@@ -1,101 +1,166 @@
-"""A nonlinear program's functions as compiled C, kept in a folder from one process to the next."""
+"""The C compiler: found once for all of nocl, and its libraries kept in a cache whose entries are checked before use.
+
+A library's file is called KIND-IDENTITY-CONTENT.so. IDENTITY tells what it was built from, by which compiler and for
+which processor; CONTENT is the digest of its bytes. So a file that was cut off or altered is not what its name says,
+is never loaded, and is built again. Files are moved in whole: two processes may build the same one at once.
+"""
 
 from __future__ import annotations
 
-import hashlib
+import ctypes
+import fcntl
 import os
 import platform
+import shlex
 import shutil
 import subprocess
 import tempfile
+import threading
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
-import casadi as ca
-import numpy as np
+from nocl.support.atomic import write_bytes
+from nocl.support.fingerprint import fingerprint, sha256
 
-CACHE_VARIABLE = "NOCL_CACHE"  # names a folder for compiled code; without it it lives as long as the process
-FLAGS = ("-O2", "-march=native", "-fPIC", "-shared")
-PLAIN = ("SXFunction", "MXFunction", "Map", "BSplineInterpolant", "LinearInterpolant")  # Functions that C has all of
-
-
-def folder_of(compiled: bool | str | os.PathLike[str]) -> str:
-    """The folder for compiled code: the one that is named, NOCL_CACHE, or one that lives as long as the process."""
-    if not isinstance(compiled, bool):
-        return os.fspath(compiled)
-    return os.environ.get(CACHE_VARIABLE) or _own_folder().name
+CACHE_VARIABLE = "NOCL_CACHE"  # names a folder for libraries; without it they live as long as the process
+OWN, LOCK = "nocl-libraries-", "lock"  # folders of processes, and the file that each holds locked while it lives
+_ONCE = threading.Lock()
 
 
-@lru_cache
-def _own_folder() -> tempfile.TemporaryDirectory[str]:
-    return tempfile.TemporaryDirectory(prefix="nocl-programs-")
+class NoCompilerError(ValueError):
+    """There is no C compiler on this machine."""
 
 
-def target(folder: str, key: str) -> Path:
-    """Where the library of the program with this key is, or will be: for this compiler, machine and CasADi alone."""
-    return Path(folder) / f"nlp-{fingerprint(key, ca.CasadiMeta.version(), _compiler(), _processor(), FLAGS)}.so"
+class CompilerError(RuntimeError):
+    """The compiler refused a source."""
 
 
-@lru_cache
-def _compiler() -> tuple[str, str]:
-    """(path, version) of the C compiler: $CC, gcc or cc."""
-    for name in (os.environ.get("CC"), "gcc", "cc"):
-        path = shutil.which(name) if name else None
+def command() -> tuple[str, ...]:
+    """The C compiler with its own arguments: $CC (like "gcc -m64"), or else gcc or cc; NoCompilerError without one."""
+    named = os.environ.get("CC", "")
+    try:
+        words = shlex.split(named)
+    except ValueError as error:
+        raise NoCompilerError(f"CC is {named!r} ({error}); expected a command like 'gcc -m64': close its "
+                              "quotes") from error
+    for name, *arguments in [words] if words else [["gcc"], ["cc"]]:
+        path = shutil.which(name)
         if path:
-            return path, subprocess.run([path, "--version"], capture_output=True, text=True, check=False).stdout
-    raise ValueError("NMPC: no C compiler found (looked for $CC, gcc, cc): install gcc, or leave `compiled` out")
+            return path, *arguments
+    looked = f"CC={words[0]}" if words else "gcc, cc"
+    raise NoCompilerError(f"no C compiler found (looked for {looked}): install gcc, or name one in the environment "
+                          "variable CC")
+
+
+def run(arguments: Sequence[str | os.PathLike[str]], what: str) -> None:
+    """Run the compiler; CompilerError with its words where it refuses `what`."""
+    words = [*command(), *(os.fspath(a) for a in arguments)]
+    result = _ran(words)
+    if result.returncode:
+        raise CompilerError(f"{words[0]} could not compile {what}:\n{result.stderr.strip()[-2000:]}")
+
+
+def library(kind: str, identity: Sequence[Any], build: Callable[[Path], Path],
+            cache: str | os.PathLike[str] | None = None) -> Path:
+    """The shared library that `build` makes, from the cache where a whole one is there.
+
+    Parameters
+    ----------
+    kind : what the file's name begins with
+    identity : all that the library depends on beside compiler and processor, for `fingerprint`
+    build : writes sources to the folder it gets, and returns the library that it made there (by `run`)
+    cache : the folder; default: see `cache_folder`
+
+    Raises NoCompilerError, CompilerError, and ValueError for a folder that cannot be written to.
+    """
+    name = f"{kind}-{fingerprint(identity, command(), _version(command()), processor())}"
+    folder = cache_folder(cache)
+    found = _whole(folder, name)
+    if found is not None:
+        return found
+    with tempfile.TemporaryDirectory(dir=own_folder()) as scratch:  # a kill while building leaves the cache as it was
+        content = build(Path(scratch)).read_bytes()
+    return write_bytes(folder / _file(name, content), content, durable=False)
+
+
+def cache_folder(named: str | os.PathLike[str] | None = None) -> Path:
+    """The folder that is named, or the one that NOCL_CACHE names, or one that goes with the process."""
+    return Path(named or os.environ.get(CACHE_VARIABLE) or own_folder())
+
+
+def load(path: str | os.PathLike[str]) -> ctypes.CDLL:
+    """A library that was built here; ValueError where the system does not load it."""
+    try:
+        return ctypes.CDLL(os.fspath(path))
+    except OSError as error:
+        raise ValueError(f"{path} cannot be loaded ({error}); expected a folder that programs may run from: name "
+                         f"another one in {CACHE_VARIABLE} or TMPDIR, and see what CC adds to the compiler") from error
+
+
+def _file(name: str, content: bytes) -> str:
+    return f"{name}-{sha256(content)[:16]}.so"
+
+
+def _whole(folder: Path, name: str) -> Path | None:
+    """A file of this name whose content is what it says. Others stay: someone may be replacing them right now."""
+    for path in folder.glob(f"{name}-*.so"):
+        try:
+            whole = path.is_file() and path.name == _file(name, path.read_bytes())
+        except OSError:  # unreadable, as good as none
+            continue
+        if whole:
+            return path
+    return None
 
 
 @lru_cache
-def _processor() -> str:
+def _version(compiler: tuple[str, ...]) -> str:
+    return _ran([compiler[0], "--version"]).stdout
+
+
+def _ran(words: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    try:
+        return subprocess.run(words, capture_output=True, text=True, errors="replace", check=False)
+    except OSError as error:
+        raise NoCompilerError(f"the C compiler {words[0]} cannot be run ({error.strerror}): install gcc, or name "
+                              "another one in the environment variable CC") from error
+
+
+@lru_cache
+def processor() -> str:
     """What -march=native means here: code for one processor must not be loaded on another."""
     try:
         lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return platform.machine() + next(line for line in lines if line.startswith(("flags", "Features")))
+        flags = next(line for line in lines if line.startswith(("flags", "Features")))
     except (OSError, StopIteration):
-        return platform.machine() + platform.processor()
+        flags = platform.processor()
+    return platform.machine() + flags
 
 
-def build(solver: ca.Function, library: Path) -> None:
-    """Compile the functions that a solver calls; two builders of one library do not collide."""
-    library.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=library.parent) as scratch:
-        code, part = Path(scratch, "nlp.c"), Path(scratch, "nlp.so")
-        _generate(solver, scratch, code.name)
-        command = [_compiler()[0], *FLAGS, str(code), "-o", str(part), "-lm"]
-        result = subprocess.run(command, capture_output=True, text=True, check=False)
-        if result.returncode:
-            raise RuntimeError(f"{command[0]} could not compile the program of NMPC:\n{result.stderr[-2000:]}")
-        os.replace(part, library)
+def own_folder() -> Path:
+    """A folder that goes with the process; what processes that were killed have left is removed first."""
+    with _ONCE:
+        return Path(_own_folder()[0].name)
 
 
-def _generate(solver: ca.Function, folder: str, name: str) -> None:
-    """C source of the functions that a solver calls; its generate_dependencies can write to the working folder only."""
-    generator = ca.CodeGenerator(name)
-    for function in (solver.oracle(), *(solver.get_function(part) for part in solver.get_function())):
-        generator.add(function)
-    generator.generate(folder + os.sep)
+@lru_cache
+def _own_folder() -> tuple[tempfile.TemporaryDirectory[str], IO[bytes]]:
+    _remove_left()
+    folder = tempfile.TemporaryDirectory(prefix=OWN, ignore_cleanup_errors=True)
+    part = Path(folder.name, "part")
+    held = part.open("wb")  # kept open: the system lets the lock go when the process ends, whatever ends it
+    fcntl.flock(held, fcntl.LOCK_EX)
+    os.replace(part, part.with_name(LOCK))  # only now can others see it, locked
+    return folder, held
 
 
-def fingerprint(*parts: Any) -> str:
-    """A hash of bytes, strings, numbers, arrays and Functions."""
-    total = hashlib.sha256()
-    for part in parts:
-        part = _text(part) if isinstance(part, ca.Function) else part
-        data = part if isinstance(part, bytes) else np.ascontiguousarray(part).tobytes() if isinstance(
-            part, np.ndarray) else repr(part).encode()
-        total.update(f"{len(data)}:".encode() + data)
-    return total.hexdigest()[:32]
-
-
-def _text(function: ca.Function) -> str:
-    """What a Function is: its C, where C has all of it, else its serialisation.
-
-    A serialisation changes with use: a spline in it keeps its derivative once that was asked for.
-    """
-    if all(part.class_name() in PLAIN for part in (function, *function.find_functions())):
-        generator = ca.CodeGenerator("function")
-        generator.add(function)
-        return str(generator.dump())
-    return str(function.serialize())
+def _remove_left() -> None:
+    for lock in Path(tempfile.gettempdir()).glob(f"{OWN}*/{LOCK}"):
+        try:
+            with lock.open("rb") as file:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(lock.parent, ignore_errors=True)
+        except OSError:  # its process lives, or it is another user's
+            continue

@@ -6,9 +6,9 @@ A task has a name, unique in its run, a size (states), and `outcome(arrays)`, wh
 
 from __future__ import annotations
 
+import io
 import json
 import logging
-import os
 import pickle
 import time
 from collections.abc import Iterator, Sequence
@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from nocl.support.atomic import write_bytes
 from nocl.support.lock import alone
 
 Task = Any
@@ -220,7 +221,7 @@ class Journal:
             raise ValueError(f"{self.folder} is not empty and holds no run of {self.solver}; expected a new folder: "
                              "change `out`")
         (self.folder / TASKS).mkdir(parents=True, exist_ok=True)
-        _write(manifest, json.dumps({"kind": f"nocl {self.solver} run", "key": self.key}).encode())
+        write_bytes(manifest, json.dumps({"kind": f"nocl {self.solver} run", "key": self.key}).encode())
 
     def file(self, name: str) -> Path:
         assert self.folder is not None
@@ -238,16 +239,9 @@ class Journal:
     def write(self, outcome: Outcome) -> None:
         if self.folder is None:
             return
-        target = self.file(outcome.name)
-        part = target.with_name(f".{target.stem}-{os.getpid()}.part.npz")
-        np.savez(part, **outcome.arrays())
-        os.replace(part, target)
-
-
-def _write(target: Path, content: bytes) -> None:
-    part = target.with_name(f".{target.name}-{os.getpid()}.part")
-    part.write_bytes(content)
-    os.replace(part, target)
+        content = io.BytesIO()
+        np.savez(content, **outcome.arrays())
+        write_bytes(self.file(outcome.name), content.getvalue(), durable=False)
 
 
 def stream(job: Any, tasks: Sequence[Task], pool: Pool, journal: Journal, show: bool, what: str) -> Iterator[Outcome]:

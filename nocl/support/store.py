@@ -7,11 +7,8 @@ temporary file in the same folder and is then renamed: an interrupted save leave
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
-import os
-import uuid
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -22,7 +19,9 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
+from nocl.support.atomic import write_bytes
 from nocl.support.checks import MALFORMED
+from nocl.support.fingerprint import sha256
 
 FORMAT = 1  # raised when an older nocl could misread what is written
 SUFFIX = ".safetensors"
@@ -57,8 +56,7 @@ def load_checkpoint(path: str | Path) -> tuple[Any, dict[str, Any]]:
 def write_json(path: str | Path, data: Any) -> Path:
     """Write JSON atomically; numpy arrays become lists, and NaN, inf (JSON has none) 'nan', 'inf', '-inf'."""
     path = Path(path)
-    _replace(path, (json.dumps(_plain(data, path.name), indent=2, allow_nan=False) + "\n").encode())
-    return path
+    return write_bytes(path, (json.dumps(_plain(data, path.name), indent=2, allow_nan=False) + "\n").encode())
 
 
 def read_json(path: str | Path) -> Any:
@@ -79,34 +77,6 @@ def write_text(path: str | Path, text: str) -> Path:
     return write_bytes(path, text.encode())
 
 
-def write_bytes(path: str | Path, content: bytes) -> Path:
-    """Write a file atomically."""
-    path = Path(path)
-    _replace(path, content)
-    return path
-
-
-def _replace(path: Path, content: bytes) -> None:
-    """Put `content` at `path`, all or nothing."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        part = path.with_name(f".{path.name}.{uuid.uuid4().hex}.part")
-    except OSError as error:
-        raise ValueError(f"{path.parent} cannot be made ({error.strerror}); expected a folder to write to: "
-                         "name another one") from error
-    try:
-        with open(part, "xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(part, path)
-    except OSError as error:
-        raise ValueError(f"{path} cannot be written ({error.strerror}); nothing was changed: make room or name "
-                         "another folder") from error
-    finally:
-        part.unlink(missing_ok=True)
-
-
 def write_tensors(path: Path, kind: str, tensors: Mapping[str, Tensor], structure: Mapping[str, Any]) -> None:
     """Write tensors by name and a JSON structure as one file of a kind."""
     own = {key: value.detach().cpu().clone(memory_format=torch.contiguous_format) for key, value in tensors.items()}
@@ -116,7 +86,7 @@ def write_tensors(path: Path, kind: str, tensors: Mapping[str, Tensor], structur
         raise ValueError(f"{path.name}: {error}; expected plain data (numbers, strings, lists, dicts) in its card or "
                          "meta: convert it first") from error
     header = {"nocl": kind, "format": str(FORMAT), "structure": text, "sha256": _digest(own, kind, text)}
-    _replace(path, safetensors.torch.save(own, header))
+    write_bytes(path, safetensors.torch.save(own, header))
 
 
 def read_tensors(path: Path, kind: str) -> tuple[dict[str, Tensor], dict[str, Any]]:
@@ -151,13 +121,16 @@ def _what(header: Mapping[str, str]) -> str:
 
 
 def _digest(tensors: Mapping[str, Tensor], kind: str, structure: str) -> str:
-    """SHA-256 over names, shapes, types and bytes of all tensors, the kind and the structure."""
-    sha = hashlib.sha256(f"{kind}\n{structure}\n".encode())
+    """SHA-256 over names, shapes, types and bytes of all tensors, the kind and the structure.
+
+    Format 1 fixes these bytes: files that were saved with them must load.
+    """
+    chunks: list[bytes | str] = [f"{kind}\n{structure}\n"]
     for key in sorted(tensors):
         value = tensors[key]
-        sha.update(f"{key} {value.dtype} {tuple(value.shape)}\n".encode())
-        sha.update(value.reshape(-1).view(torch.uint8).numpy().tobytes())
-    return sha.hexdigest()
+        chunks.append(f"{key} {value.dtype} {tuple(value.shape)}\n")
+        chunks.append(value.reshape(-1).view(torch.uint8).numpy().tobytes())
+    return sha256(*chunks)
 
 
 def _flatten(value: Any, key: str, tensors: dict[str, Tensor]) -> Any:

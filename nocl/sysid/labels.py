@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from nocl.data import Dataset
 from nocl.support.checks import Array
+from nocl.support.fingerprint import fingerprint
 from nocl.sysid import structure as structures
 from nocl.sysid.affine import stated_affine
 from nocl.sysid.settings import Settings
@@ -39,11 +39,8 @@ class Source:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the given data; empty where labels are drawn."""
-        whole = hashlib.sha256()
-        for array in self.data or ():
-            whole.update(b"none" if array is None else np.ascontiguousarray(array).tobytes())
-        return whole.hexdigest() if self.data else ""
+        """A fingerprint of the given data; empty where labels are drawn."""
+        return fingerprint(*self.data) if self.data else ""
 
     @staticmethod
     def of(system: System, data: Dataset | None, gradients: bool) -> Source:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any
-
-import numpy as np
+from typing import Any, ClassVar
 
 from nocl.nets import ACTIVATIONS
+from nocl.support.fields import Checked, Scaled, choice, count, flag, nonnegative, positive
 
 
 @dataclass(frozen=True)
@@ -32,37 +31,37 @@ class Budget:
             return Budget(32, 3000, 1024, 60, 1024)
         return Budget(48 if variables <= 6 else 96, 6000, 1024, 40, 1024)
 
-
     @staticmethod
     def plain(variables: int) -> Budget:
         """Of one plain network of many variables with Jacobian labels (nocl.sysid_plain), one to two minutes."""
         return Budget(96 if variables <= 6 else 128, 15_000, 512, 0, 512)
 
 
+BY_SIZE = "by the number of its variables"
+
+
 @dataclass(frozen=True)
-class Settings:
+class Settings(Scaled):
     """Of methods "default" and "mlp". None: by the number of a network's variables, as in Budget.of."""
 
-    # where labels are fewer than two for each weight, networks are narrower than this, and polished for longer
-    width: int | None = None
-    iterations: int | None = None
-    batch: int | None = None
-    polish: int | None = None  # Levenberg-Marquardt steps; none for networks of more than 2,600 parameters
-    polish_batch: int | None = None
-    lr: float = 4e-3  # of SOAP, cosine schedule
-    samples: int = 200_000  # labels of f to draw (with data: all of it is used, and no more)
-    gradient_weight: float = 1.0  # of derivatives beside values, each in units of its own spread
-    structure: bool = True  # read the structure off the Jacobian labels first
-    features: bool = True  # look for polynomials in variables and sin, cos of angles
-    angles: bool = True  # networks see angles as sin and cos
-    probes: int = 64  # points at which the structure is looked for, for each variable
+    EFFORT: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "quick": {"iterations": 300, "polish": 10},
+        "best": {"polish": 200}}
 
-    def __post_init__(self) -> None:
-        given = [n for n in ("width", "batch", "polish_batch") if getattr(self, n) is not None]
-        _positive(self, (*given, "samples", "probes"), integer=True)
-        _positive(self, [n for n in ("iterations", "polish") if getattr(self, n) is not None], integer=True, zero=True)
-        _positive(self, ("lr",))
-        _positive(self, ("gradient_weight",), zero=True)
+    # where labels are fewer than two for each weight, networks are narrower than this, and polished for longer
+    width: int | None = count(None, "of a network's two hidden layers", none=BY_SIZE)
+    iterations: int | None = count(None, "of SOAP", least=0, none=BY_SIZE)
+    batch: int | None = count(None, "labels in a step of SOAP", none=BY_SIZE)
+    polish: int | None = count(None, "Levenberg-Marquardt steps; none for networks of more than 2,600 parameters",
+                               least=0, none=BY_SIZE)
+    polish_batch: int | None = count(None, "labels in each of those", none=BY_SIZE)
+    lr: float = positive(4e-3, "of SOAP, cosine schedule")
+    samples: int = count(200_000, "labels of f to draw (with data: all of it is used, and no more)")
+    gradient_weight: float = nonnegative(1.0, "of derivatives beside values, each in units of its own spread")
+    structure: bool = flag(True, "read the structure off the Jacobian labels first")
+    features: bool = flag(True, "look for polynomials in variables and sin, cos of angles")
+    angles: bool = flag(True, "networks see angles as sin and cos")
+    probes: int = count(64, "points at which the structure is looked for, for each variable")
 
     def budget(self, variables: int, plain: bool = False) -> Budget:
         """The budget of a network of so many variables."""
@@ -72,53 +71,34 @@ class Settings:
 
 
 @dataclass(frozen=True)
-class LogSettings:
+class LogSettings(Scaled):
     """Of identification from logged trajectories."""
 
-    width: int = 32  # of the two hidden layers
-    iterations: int = 300  # of L-BFGS on derivatives
-    steps: int = 20  # Gauss-Newton steps on simulation error, at most; 0: derivatives alone
-    window: int = 40  # samples that are simulated in one go
-    windows: int = 1000  # at most, drawn at random beyond
-    substeps: int = 1  # RK4 steps between two samples
-    ridge: float = 1e-6  # times the sum of squared weights, beside the mean of squared residuals
-    angles: bool = True  # networks see angles as sin and cos
+    EFFORT: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "quick": {"width": 12, "iterations": 60, "steps": 3, "window": 20},
+        "best": {"iterations": 600, "steps": 60, "windows": 3000}}
 
-    def __post_init__(self) -> None:
-        _positive(self, ("width", "window", "windows", "substeps"), integer=True)
-        _positive(self, ("iterations", "steps"), integer=True, zero=True)
-        _positive(self, ("ridge",), zero=True)
+    width: int = count(32, "of the two hidden layers")
+    iterations: int = count(300, "of L-BFGS on derivatives", least=0)
+    steps: int = count(20, "Gauss-Newton steps on simulation error, at most; 0: derivatives alone", least=0)
+    window: int = count(40, "samples that are simulated in one go")
+    windows: int = count(1000, "at most, drawn at random beyond")
+    substeps: int = count(1, "RK4 steps between two samples")
+    ridge: float = nonnegative(1e-6, "times the sum of squared weights, beside the mean of squared residuals")
+    angles: bool = flag(True, "networks see angles as sin and cos")
 
 
 @dataclass(frozen=True)
-class PaperSettings:
+class PaperSettings(Checked):
     """Of method "paper": a three-layer MLP (two hidden layers), Adam, exponentially decaying rate."""
 
-    width: int = 128
-    layers: int = 3  # of weights
-    activation: str = "sine"
-    iterations: int = 50_000
-    batch: int = 256
-    lr: float = 0.01
-    final_lr: float = 1e-5
-    samples: int = 200_000
-    frequency: float = 6.0  # standard deviation of angles as inputs, in which f oscillates; of others, and outputs: 1
-
-    def __post_init__(self) -> None:
-        _positive(self, ("width", "iterations", "batch", "samples"), integer=True)
-        _positive(self, ("lr", "final_lr", "frequency"))
-        if not isinstance(self.layers, int) or self.layers < 2:
-            raise ValueError(f"PaperSettings: layers is {self.layers!r}; expected an integer >= 2")
-        if self.activation not in ACTIVATIONS:
-            raise ValueError(f"PaperSettings: activation is {self.activation!r}; "
-                             f"expected one of {', '.join(ACTIVATIONS)}")
-
-
-def _positive(settings: Any, names: Sequence[str], *, integer: bool = False, zero: bool = False) -> None:
-    for name in names:
-        value = getattr(settings, name)
-        kind = int if integer else (int, float)
-        good = isinstance(value, kind) and not isinstance(value, bool) and np.isfinite(value)
-        if not good or value < 0 or (value == 0 and not zero):
-            what = f"{'an integer' if integer else 'a number'} {'>= 0' if zero else '> 0'}"
-            raise ValueError(f"{type(settings).__name__}: {name} is {value!r}; expected {what}")
+    width: int = count(128, "of the hidden layers")
+    layers: int = count(3, "of weights", least=2)
+    activation: str = choice("sine", "of the hidden layers", ACTIVATIONS)
+    iterations: int = count(50_000, "of Adam")
+    batch: int = count(256, "labels in a step of Adam")
+    lr: float = positive(0.01, "of Adam, at the start")
+    final_lr: float = positive(1e-5, "of Adam, at the end")
+    samples: int = count(200_000, "labels of f to draw")
+    frequency: float = positive(6.0, "standard deviation of angles as inputs, in which f oscillates; of others, and "
+                                "outputs: 1")

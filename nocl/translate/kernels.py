@@ -3,16 +3,10 @@
 from __future__ import annotations
 
 import ctypes
-import hashlib
 import os
-import platform
-import shlex
-import shutil
-import subprocess
-import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +14,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from nocl.support.compiler import CACHE_VARIABLE
+from nocl.support import compiler
+from nocl.support.compiler import CompilerError
 from nocl.translate.instructions import instructions
 
 HEADERS = Path(__file__).parent / "csrc"
@@ -77,15 +72,13 @@ def _operation(op: str, args: list[str], function: str) -> str:
     return template.format(*args)
 
 
-class NoCompilerError(ValueError):
-    """There is no C compiler on this machine."""
-
-
 class Kernel:
     """A compiled library of source that includes lanes.h: its functions take (first block, last block, index, ...)."""
 
     def __init__(self, source: str, cache: str | os.PathLike[str] | None = None) -> None:
-        self._library = ctypes.CDLL(str(_build(source, cache)))
+        headers = [path.read_text() for path in sorted(HEADERS.glob("*.h"))]
+        path = compiler.library("kernel", [source, headers, FLAGS], partial(_build, source), cache)
+        self._library = compiler.load(path)
         self.width = int(self._library.nocl_width())
 
     def __call__(self, name: str, problems: NDArray[np.int64], *args: object, threads: int = 1) -> None:
@@ -121,56 +114,13 @@ def _c(value: object) -> Any:
     return ctypes.c_int64(int(value))  # type: ignore[call-overload]
 
 
-def _compiler() -> list[str]:
-    """The command of the C compiler: $CC, or else gcc or cc; NoCompilerError where there is none."""
-    named = shlex.split(os.environ.get("CC", ""))
-    for command in [named] if named else [["gcc"], ["cc"]]:
-        path = shutil.which(command[0])
-        if path:
-            return [path, *command[1:]]
-    looked = f"CC={named[0]}" if named else "gcc, cc"
-    raise NoCompilerError(f"no C compiler found (looked for {looked}), and kernels are C: install gcc, or name one in "
-                          "CC")
-
-
-@lru_cache
-def _version(path: str) -> str:
-    return subprocess.run([path, "--version"], capture_output=True, text=True, check=False).stdout
-
-
-@lru_cache
-def _own_folder() -> tempfile.TemporaryDirectory[str]:
-    return tempfile.TemporaryDirectory(prefix="nocl-kernels-")
-
-
-def _machine() -> str:
-    """What -march=native means here: kernels of one machine must not be loaded on another."""
+def _build(source: str, folder: Path) -> Path:
+    """The compiled library of this source, in `folder`."""
+    code, target = folder / "kernel.c", folder / "kernel.so"
+    code.write_text(source)
+    plain = [*FLAGS, f"-I{HEADERS}", str(code), "-o", str(target), "-lm", "-Wl,-z,defs"]
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        flags = next(line for line in lines if line.startswith(("flags", "Features")))
-    except (OSError, StopIteration):
-        flags = platform.processor()
-    return platform.machine() + flags
-
-
-def _build(source: str, cache: str | os.PathLike[str] | None) -> Path:
-    """The compiled library of this source, from the cache folder where it is there; two builders do not collide."""
-    compiler = _compiler()
-    folder = Path(cache or os.environ.get(CACHE_VARIABLE) or _own_folder().name)
-    folder.mkdir(parents=True, exist_ok=True)
-    headers = [p.read_text() for p in sorted(HEADERS.glob("*.h"))]
-    identity = [source, *headers, *compiler, _version(compiler[0]), _machine(), *FLAGS]
-    key = hashlib.sha256("\0".join(identity).encode()).hexdigest()[:32]
-    target = folder / f"{key}.so"
-    if target.exists():
-        return target
-    with tempfile.TemporaryDirectory(dir=folder) as scratch:
-        code, library = Path(scratch, "kernel.c"), Path(scratch, "kernel.so")
-        code.write_text(source)
-        for extra in (["-DWITH_MVEC", "-lmvec"], []):  # not every C library has vector mathematics
-            command = [*compiler, *FLAGS, f"-I{HEADERS}", str(code), "-o", str(library), *extra, "-lm", "-Wl,-z,defs"]
-            result = subprocess.run(command, capture_output=True, text=True, check=False)
-            if result.returncode == 0:
-                os.replace(library, target)
-                return target
-    raise RuntimeError(f"{compiler[0]} could not compile a kernel of nocl's:\n{result.stderr[-2000:]}")
+        compiler.run([*plain, "-DWITH_MVEC", "-lmvec"], "a kernel of nocl's")
+    except CompilerError:  # not every C library has vector mathematics
+        compiler.run(plain, "a kernel of nocl's")
+    return target

@@ -39,7 +39,7 @@ from nocl import hjb
 from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.cnd.identity import identity
-from nocl.solvers.cnd.published_settings import STEPS, PaperSettings
+from nocl.solvers.cnd.settings import STEPS, PaperSettings
 from nocl.support import store
 from nocl.translate.fused import FusedStep
 from nocl.translate.torch_functions import to_torch

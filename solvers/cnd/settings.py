@@ -1,49 +1,92 @@
-"""Settings of the default training method."""
+"""Settings of both training methods: the default's, and those of method="paper"."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from nocl import hjb
+from nocl.nets import ACTIVATIONS
+from nocl.support.fields import Checked, Scaled, choice, coefficients, count, flag, positive, widths
+from nocl.translate.rk4 import rk4_cost
+
+STEPS: dict[str, hjb.Step] = {"rk4": rk4_cost, "euler": hjb.euler_cost}
 
 
 @dataclass(frozen=True)
-class TrainSettings:
-    """The default method's settings."""
+class TrainSettings(Scaled):
+    """The default method's settings; `TrainSettings.of("best", seeds=40)` scales what belongs together."""
 
-    intervals: int = 80  # RK4 steps and held controls of each labelled solution
-    seeds: int = 20  # initial states solved globally, from cold starts
-    starts: int = 16  # cold starts of each
-    states: int = 400  # further initial states, solved from their neighbours
-    tails: int = 3000  # optimal tails from the tube
-    width: float = 0.25  # of the tube, in units of each state's spread along the solutions
-    visits: int = 2000  # visited states solved in each round
-    kick: float = 0.1  # pushes on the visiting policy, in units of each state's spread
-    rounds: int = 3  # of visited states, at most
-    least_rounds: int = 2  # and at least: the gap is met sooner than under disturbances
-    iterations: int = 2000  # of each regression; twice as many from the round on that may be the last
-    batch: int = 1024
-    lr: float = 4e-3
-    hidden: tuple[int, ...] = (64, 64, 64)
-    control_dt: bool = False  # True: u(x, t, dt), optimal in continuous time and held for dt; see CND.at_rate
-    value: bool = True  # whether to train V(x, t) too
-    value_initial: int = 1500  # initial states solved for V, from the nearest solutions and the policy's own answers
-    value_tails: int = 6000  # tails solved for it, from the tube
-    value_visits: int = 3000  # more of them, from states that the policy visits under kicks
-    value_iterations: int = 7000  # of the first fit of V; twice as many of further ones
-    value_rounds: int = 3  # fits of V at most: each further one on as many labels more
-    value_error: float = 2.5e-3  # stop once met: mean of |V - J*| / J* at held-out initial, tube and kicked states
-    held_out: int = 64  # initial states that tell when to stop
-    gap_median: float = 2e-4  # stop once both are met: (J - J*) / J*, median over the held-out states,
-    gap_p95: float = 1e-3  # and its 95th percentile
+    EFFORT: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "quick": {"seeds": 6, "starts": 6, "states": 60, "tails": 300, "visits": 200, "rounds": 1, "iterations": 400,
+                  "value_tails": 400, "value_visits": 200, "value_iterations": 300, "held_out": 16},
+        # what was enough for a wide set of initial states, where the defaults are not: docs/experiments.md
+        "best": {"seeds": 80, "states": 3000, "tails": 6000, "visits": 6000, "rounds": 5, "least_rounds": 3,
+                 "iterations": 3000, "hidden": (128, 128, 128), "value_initial": 3000, "value_tails": 12_000,
+                 "value_visits": 6000, "value_iterations": 10_000, "value_error": 1e-3, "held_out": 128,
+                 "gap_median": 5e-5, "gap_p95": 2.5e-4}}
+
+    intervals: int = count(80, "RK4 steps and held controls of each labelled solution")
+    seeds: int = count(20, "initial states solved globally, from cold starts")
+    starts: int = count(16, "cold starts of each")
+    states: int = count(400, "further initial states, solved from their neighbours", least=0)
+    tails: int = count(3000, "optimal tails from the tube", least=0)
+    width: float = positive(0.25, "of the tube, in units of each state's spread along the solutions")
+    visits: int = count(2000, "visited states solved in each round")
+    kick: float = positive(0.1, "pushes on the visiting policy, in units of each state's spread")
+    rounds: int = count(3, "of visited states, at most", least=0)
+    least_rounds: int = count(2, "and at least: the gap is met sooner than under disturbances", least=0)
+    iterations: int = count(2000, "of each regression; twice as many from the round on that may be the last")
+    batch: int = count(1024, "labels in a step of a regression")
+    lr: float = positive(4e-3, "of SOAP")
+    hidden: tuple[int, ...] = widths((64, 64, 64), "of the hidden layers of u and of V")
+    control_dt: bool = flag(False, "True: u(x, t, dt), optimal in continuous time and held for dt; see CND.at_rate")
+    value: bool = flag(True, "whether to train V(x, t) too")
+    value_initial: int = count(1500, "initial states solved for V, from the nearest solutions and the policy's answers")
+    value_tails: int = count(6000, "tails solved for V, from the tube")
+    value_visits: int = count(3000, "more of them, from states that the policy visits under kicks")
+    value_iterations: int = count(7000, "of the first fit of V; twice as many of further ones")
+    value_rounds: int = count(3, "fits of V at most: each further one on as many labels more")
+    value_error: float = positive(2.5e-3, "stop once met: mean of |V - J*| / J* at held-out initial, tube and kicked "
+                                  "states")
+    held_out: int = count(64, "initial states that tell when to stop")
+    gap_median: float = positive(2e-4, "stop once both are met: (J - J*) / J*, median over the held-out states")
+    gap_p95: float = positive(1e-3, "and its 95th percentile")
+
+
+@dataclass(frozen=True)
+class PaperSettings(Checked):
+    """Settings of method="paper"; the defaults are the paper's wherever it says."""
+
+    hidden: Sequence[int] = widths((64, 64), "of the controller")
+    value_hidden: Sequence[int] = widths((64, 64), "of the value function")
+    activation: str = choice("tanh", "of the hidden layers", ACTIVATIONS)
+    time_input: bool = flag(False, "True: u(x, t), which a finite horizon's optimum needs; the paper has u(x)")
+    near_goal: float | None = positive(None, "the controller starts at u*, its last layer's random weights times this",
+                                       none="weights as random as the others'")
+    sin_cos: bool = flag(True, "sin and cos of declared angles as inputs, beside their values")
+    intervals: int = count(40, "K: steps of a rollout")
+    step: str = choice("rk4", "of a rollout; 'euler' as published", STEPS)
+    hold: bool = flag(False, "False: feedback inside RK4's stages, as in a neural ODE; True: held over intervals")
+    fused: bool = flag(True, "held RK4 steps of the exact f as compiled C on the CPU; False: in torch, same gradients")
+    iterations: int = count(1000, "of Adam, after the race")
+    batch: int = count(64, "initial states an iteration")
+    learning_rate: float = positive(0.01, "of Adam")
+    decay: float = positive(0.01, "the learning rate falls exponentially to this share of its start; 1: no decay",
+                            most=1)
+    weights: tuple[float, float, float, float] = coefficients(
+        (1.0, 1.0, 0.01, 0.01), "of L_cost, L_HJB, L_final, L_hamil", nonzero=1)
+    clip: float | None = positive(1.0, "the gradient's norm, of u and of V each", none="not clipped")
+    detach: bool = flag(False, "True: L_HJB, L_final, L_hamil see the trajectory's states as constants")
+    race: int = count(8, "random initial controllers that start side by side; 1: no race")
+    race_iterations: int = count(200, "of L_cost alone, for each of them")
+    race_batch: int = count(16, "initial states an iteration, for each of them")
+    patience: int | None = count(None, "stop after so many of the 40 checks without a lower held-out cost",
+                                 none="never")
 
     def __post_init__(self) -> None:
-        for f in fields(self):
-            value, least = getattr(self, f.name), 0 if f.name in ("rounds", "least_rounds", "states", "tails") else 1
-            if f.type == "int" and (isinstance(value, bool) or not isinstance(value, int) or value < least):
-                raise ValueError(f"TrainSettings: {f.name} is {value!r}; expected a whole number of at least {least}")
-            if f.type == "float" and not (isinstance(value, (int, float)) and 0 < value < float("inf")):
-                raise ValueError(f"TrainSettings: {f.name} is {value!r}; expected a positive number")
-            if f.type == "bool" and not isinstance(value, bool):
-                raise ValueError(f"TrainSettings: {f.name} is {value!r}; expected True or False")
-        widths = self.hidden if isinstance(self.hidden, (tuple, list)) else ()
-        if not widths or not all(isinstance(h, int) and not isinstance(h, bool) and h > 0 for h in widths):
-            raise ValueError(f"TrainSettings: hidden is {self.hidden!r}; expected widths such as (64, 64, 64)")
+        super().__post_init__()
+        if not self.hold and self.step != "rk4":
+            raise ValueError(f"PaperSettings: step is {self.step!r} with hold=False; expected step='rk4', which "
+                             "feedback in continuous time is integrated by")

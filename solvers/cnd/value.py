@@ -26,7 +26,7 @@ from nocl.solvers.cnd.validate import refined
 from nocl.solvers.ddp.bank import SolutionBank
 from nocl.solvers.ddp.solver import DDP, DDPSolution
 from nocl.support.checks import Array
-from nocl.translate.kernels import NoCompilerError
+from nocl.support.compiler import NoCompilerError
 from nocl.translate.torch_functions import to_torch
 
 SMALL = 0.02  # of the median: labels below count as if they were that large in relative errors

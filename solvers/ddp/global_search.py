@@ -35,7 +35,7 @@ from nocl.solvers.nmpc.guesses import jacobian_of, mirrored, mirrors
 from nocl.solvers.nmpc.search import SAME, TINY, distinct
 from nocl.support import checks
 from nocl.support.checks import Array
-from nocl.support.compiler import fingerprint
+from nocl.support.fingerprint import fingerprint
 
 Rows = NDArray[np.int64]
 Report = Callable[[str], None]  # told what is being done

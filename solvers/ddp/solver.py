@@ -10,7 +10,6 @@ differential dynamic programming, ICRA 2014.
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from collections import Counter
@@ -29,7 +28,8 @@ from nocl.solvers.ddp.kernel import ddp_source, pack_weights
 from nocl.solvers.ddp.without_compiler import ddp_kernel
 from nocl.support import checks
 from nocl.support.checks import Array
-from nocl.support.compiler import fingerprint
+from nocl.support.fields import Checked, count, positive
+from nocl.support.fingerprint import fingerprint
 from nocl.support.pool import Journal, Pool, stream
 
 if TYPE_CHECKING:
@@ -40,23 +40,20 @@ GROWTH, DECAY = 4.0, 2.0  # of mu, after a failure and a success: against 8 and 
 
 
 @dataclass(frozen=True)
-class DDPSettings:
+class DDPSettings(Checked):
     """When to stop, and how steps are damped."""
 
-    max_iterations: int = 200
-    tolerance: float = 1e-10  # stop when the predicted decrease of J is below tolerance * |J| + 1e-15
-    smallest_step: float = 2.0**-12  # of the line search
-    damping: float = 1e-4  # first mu added to Quu where a sweep or a line search fails
-    largest_damping: float = 1e8  # give up above it
+    max_iterations: int = count(200, "of the descent")
+    tolerance: float = positive(1e-10, "stop when the predicted decrease of J is below tolerance * |J| + 1e-15")
+    smallest_step: float = positive(2.0**-12, "of the line search", most=1)
+    damping: float = positive(1e-4, "first mu added to Quu where a sweep or a line search fails")
+    largest_damping: float = positive(1e8, "give up above it")
 
     def __post_init__(self) -> None:
-        if not isinstance(self.max_iterations, int) or self.max_iterations < 1:
-            raise ValueError(f"DDPSettings: max_iterations is {self.max_iterations!r}; expected an integer >= 1")
-        for name in ("tolerance", "smallest_step", "damping", "largest_damping"):
-            checks.number(getattr(self, name), name, "DDPSettings", positive=True)
-        if self.smallest_step > 1 or self.damping > self.largest_damping:
-            raise ValueError(f"DDPSettings: smallest_step is {self.smallest_step}, damping {self.damping}, "
-                             f"largest_damping {self.largest_damping}; expected smallest_step <= 1 and damping below")
+        super().__post_init__()
+        if self.damping > self.largest_damping:
+            raise ValueError(f"DDPSettings: damping is {self.damping:g}, largest_damping {self.largest_damping:g}; "
+                             "expected the first to be at most the second: raise largest_damping")
 
 
 class DDP:
@@ -174,7 +171,7 @@ class DDP:
     def key(self) -> str:
         """A fingerprint of the problem, the model and the settings."""
         net = None if self.dynamics is None else self.dynamics.net
-        return fingerprint(json.dumps(self.ocp.to_data(), sort_keys=True), ddp_source(self.ocp, net), self._weights,
+        return fingerprint(self.ocp.to_data(), ddp_source(self.ocp, net), self._weights,
                            self.intervals, self.settings, version("nocl"))
 
     def _run_key(self, x0: Array, t0: Array, guess: dict[str, Array], curvature: bool) -> str:

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from nocl.ocp import OCP
 from nocl.solvers.ddp.kernel import ddp_source
 from nocl.support.checks import Array
-from nocl.translate.kernels import Kernel, NoCompilerError
+from nocl.support.compiler import NoCompilerError
+from nocl.translate.kernels import Kernel
 from nocl.translate.rk4 import rk4_cost
 
 Rows = NDArray[np.int64]

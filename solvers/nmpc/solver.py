@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,9 +25,9 @@ from nocl.solvers.nmpc.loop import Loop
 from nocl.solvers.nmpc.search import TINY, Outcome, Search, Task, attempt
 from nocl.solvers.nmpc.sensitivity import dense, second_variation
 from nocl.solvers.nmpc.transcription import BACKENDS, Transcription
-from nocl.support import checks
+from nocl.support import checks, compiler
 from nocl.support.checks import Array
-from nocl.support.compiler import fingerprint, folder_of, target
+from nocl.support.fingerprint import fingerprint
 from nocl.support.pool import Journal, Pool, do
 
 BETTER = 1e-6  # relative improvement that makes a neighbour's solution worth passing on
@@ -58,8 +57,8 @@ class NMPC:
     constraints : "hard": path constraints at the nodes; "soft": the penalty of ocp.L_soft in the cost instead
     seed : of the random starts
     options : of the nlpsol, like {"ipopt.tol": 1e-6}
-    compiled : compile the program by gcc, once: into the folder that is named here, or for True into that of the
-        environment's NOCL_CACHE (without it: for as long as the process lives); later constructions load it from there
+    compiled : compile the program by the C compiler, once: into the folder that is named here, or for True into that
+        of the environment's NOCL_CACHE (without it: for as long as the process lives); later constructions load it
 
     A second NMPC of an equal problem with equal settings uses the program that the first one built.
     """
@@ -110,14 +109,19 @@ class NMPC:
     def key(self) -> str:
         """A fingerprint of the program: of the problem, models and settings that it is built from."""
         options = sorted((self.options or {}).items())
-        return fingerprint(json.dumps(self.ocp.to_data(), sort_keys=True), self.dynamics, self.terminal,
+        return fingerprint(self.ocp.to_data(), self.dynamics, self.terminal,
                            int(self.intervals), int(self.substeps), self.constraints, self.solver, options)
 
     @cached_property
     def program(self) -> Transcription:
         """The nonlinear program, built once for each problem and settings."""
-        where = "" if self.compiled is False else folder_of(self.compiled)
-        return _program(_Recipe(self.key + where, self))
+        return _program(_Recipe(f"{self.key}{self._folder or ''}", self))
+
+    @property
+    def _folder(self) -> Path | None:
+        """Where compiled code is kept; None: it is not compiled."""
+        named = None if isinstance(self.compiled, bool) else self.compiled
+        return None if self.compiled is False else compiler.cache_folder(named)
 
     @cached_property
     def mirrors(self) -> list[tuple[Array, Array]]:
@@ -220,7 +224,7 @@ def _program(recipe: _Recipe) -> Transcription:
     m = recipe.nmpc
     return Transcription(m.ocp, dynamics_function(m.ocp, m.dynamics), int(m.intervals), int(m.substeps),
                          m.constraints == "soft", m.solver, tuple(sorted((m.options or {}).items())), m.terminal,
-                         None if m.compiled is False else target(folder_of(m.compiled), m.key))
+                         None if m._folder is None else (m.key, m._folder))
 
 
 @lru_cache(maxsize=KEPT)

@@ -8,6 +8,7 @@ gap's multiplier is minus the costate of the node that it leads to: lambda_{k+1}
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -17,9 +18,8 @@ import casadi as ca
 import numpy as np
 
 from nocl.ocp import OCP
-from nocl.support import interrupt
+from nocl.support import compiler, interrupt
 from nocl.support.checks import Array
-from nocl.support.compiler import build
 from nocl.translate.rk4 import rk4_cost, rk4_interval
 
 BACKENDS: dict[str, dict[str, Any]] = {
@@ -32,6 +32,7 @@ WARM: dict[str, dict[str, Any]] = {  # near a solution: a barrier that is small 
                                                       "slack_bound_frac", "mult_bound_push")}},
     "fatrop": {"fatrop.mu_init": 1e-8},
 }
+FLAGS = ("-O2", "-march=native", "-fPIC", "-shared")  # of compiled programs
 FEASIBLE = 1e-6  # largest violation of a constraint in a solution, in the constraint's own unit
 
 
@@ -61,7 +62,7 @@ class Transcription:
     backend: str = "ipopt"
     options: tuple[tuple[str, Any], ...] = ()
     terminal: ca.Function | None = None  # (x) or (x, t) -> cost at the last node; default: G
-    binary: Path | None = None  # of compiled functions, built where it is missing; default: none, CasADi interprets
+    compiled: tuple[str, Path] | None = None  # (the program's key, cache folder) of compiled functions; or interpreted
 
     @property
     def L(self) -> ca.Function:
@@ -129,11 +130,22 @@ class Transcription:
     @cached_property
     def solver(self) -> ca.Function:
         """The nlpsol, with exact Hessians."""
-        if self.binary is None:
+        if self.compiled is None:
             return self._nlpsol(self.program, {"expand": self.expandable})
-        if not self.binary.exists():
-            build(self._nlpsol(self.program, {}), self.binary)  # not expanded: loops over the intervals stay loops
-        return self._nlpsol(str(self.binary), {})
+        key, folder = self.compiled
+        identity = [key, ca.CasadiMeta.version(), FLAGS]
+        return self._nlpsol(str(compiler.library("nlp", identity, self._build, folder)), {})
+
+    def _build(self, folder: Path) -> Path:
+        """The functions that the solver calls, compiled."""
+        solver = self._nlpsol(self.program, {})  # not expanded: loops over the intervals stay loops
+        code, library = folder / "nlp.c", folder / "nlp.so"
+        generator = ca.CodeGenerator(code.name)  # a solver's generate_dependencies writes to the working folder only
+        for function in (solver.oracle(), *(solver.get_function(part) for part in solver.get_function())):
+            generator.add(function)
+        generator.generate(f"{folder}{os.sep}")
+        compiler.run([*FLAGS, code, "-o", library, "-lm"], "the program of NMPC")
+        return library
 
     def _nlpsol(self, problem: Any, options: dict[str, Any]) -> ca.Function:
         s, N, m = self.ocp.system, self.N, self.n_path
@@ -205,7 +217,7 @@ class Transcription:
     @cached_property
     def second(self) -> Transcription:
         """The same program for IPOPT, which tells an infeasible problem from an unfinished solve."""
-        return replace(self, backend="ipopt", options=(), binary=None)
+        return replace(self, backend="ipopt", options=(), compiled=None)
 
     def violation(self, g: Array, t: Array) -> tuple[float, str]:
         """(largest violation of a constraint, which one: what, state, node, time)."""
