@@ -31,9 +31,10 @@ def features(ocp: OCP, x: Array, t: Array, dt: Array | None = None, *, plain: bo
     With dt [n] it is (x, t, dt) -> phi: the clock then stands at the middle of the time that a control is held for.
     `plain` adds the state in units that do not change with time.
     """
-    s, at, held = ocp.system, ocp.functions.feedback(), ca.SX.sym("dt")
-    state, start = at["x"], at["t"]
-    time = start if dt is None else start + held / 2
+    s, at = ocp.system, ocp.functions.feedback()
+    if dt is not None:
+        at = at.given(dt=ca.SX.sym("dt"))
+    state, time = at["x"], at["t"] if dt is None else at["t"] + at["dt"] / 2
     tau = 2 * time / ocp.horizon - 1
     to_go = ca.fmax(ocp.horizon - time, 0)
     mean, spread = _moments_in_time(x, 2 * (t if dt is None else t + dt / 2) / ocp.horizon - 1)
@@ -45,13 +46,12 @@ def features(ocp: OCP, x: Array, t: Array, dt: Array | None = None, *, plain: bo
     rush = left / (to_go + LEAST_TIME * ocp.horizon)
     clock = ca.vertcat(tau, ca.log(to_go / ocp.horizon + LEAST_TIME) / 2)
     more = [state[once]] if plain else []
-    raw = ca.vertcat(standard[once], *angles, clock, rush, *more, *([] if dt is None else [held]))
+    raw = ca.vertcat(standard[once], *angles, clock, rush, *more, *([] if dt is None else [at["dt"]]))
     given = [x, t] if dt is None else [x, t, dt]
-    more = {} if dt is None else {"dt": held}
     some = slice(None, None, -(-len(t) // 20_000))  # of every kind of label
-    values = at.function("raw", {"raw": raw}, **more)(*(np.atleast_2d(a[some].T) for a in given)).full()
+    values = at.function("raw", {"raw": raw})(*(np.atleast_2d(a[some].T) for a in given)).full()
     centre, width = values.mean(axis=1), values.std(axis=1) + 1e-6
-    return at.function("features", {"phi": (raw - ca.DM(centre)) / ca.DM(width)}, **more)
+    return at.function("features", {"phi": (raw - ca.DM(centre)) / ca.DM(width)})
 
 
 def _moments_in_time(x: Array, tau: Array) -> tuple[Array, Array]:
