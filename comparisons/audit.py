@@ -25,6 +25,7 @@ from nocl.judge import AT_BOUND, dynamics_function, policy_function
 from nocl.ocp import OCP
 from nocl.solvers.nmpc.loop import Loop
 from nocl.support.checks import Array
+from nocl.translate.arguments import Arguments
 from nocl.translate.rk4 import rk4
 
 EXACT, LEARNED = "exact f, RK4", "learned model, RK4"
@@ -50,7 +51,7 @@ def audit(report: Report, methods: Mapping[str, Any], model: Any = None) -> tupl
 
 def _audit(report: Report, judged: Judged, method: Any, learned: ca.Function | None,
            doubt: Callable[[Array, Array], Array] | None) -> MethodAudit:
-    plants = {EXACT: report.ocp.system.f} | ({} if learned is None else {LEARNED: learned})
+    plants = {EXACT: report.ocp.functions.f} | ({} if learned is None else {LEARNED: learned})
     control = _control(report.ocp, judged, method)
     rollouts = () if control is None else tuple(
         _rollout(report.ocp, name, f, judged.simulation.t, report.x0, *control) for name, f in plants.items())
@@ -124,7 +125,7 @@ def _value(report: Report, judged: Judged, method: Any) -> ValueAudit | None:
     derivatives = _derivatives(V)
     _, V_x, V_t = derivatives(s.x, s.t)
     x, u = s.x.reshape(-1, ocp.system.nx).T, s.u.reshape(-1, ocp.system.nu).T
-    flow = np.einsum("bki,bki->bk", V_x, ocp.system.f(x, u).full().T.reshape(V_x.shape))
+    flow = np.einsum("bki,bki->bk", V_x, ocp.functions.f(x, u).full().T.reshape(V_x.shape))
     hjb = V_t + ocp.L(x, u).full().reshape(B, -1) + flow
     slope = _hamiltonian_gradient(ocp)(x, u, V_x.reshape(-1, ocp.system.nx).T).full().T
     start = derivatives(report.x0[:, None], s.t[:1])[0][:, 0]
@@ -134,9 +135,10 @@ def _value(report: Report, judged: Judged, method: Any) -> ValueAudit | None:
 
 def _derivatives(V: ca.Function) -> Callable[[Array, Array], tuple[Array, Array, Array]]:
     """(x [B, n, nx], t [n]) -> V [B, n], V_x [B, n, nx], V_t [B, n]."""
-    x, t = V.mx_in()
-    gradient = ca.Function("gradient", [x, t], [V(x, t), ca.densify(ca.jacobian(V(x, t), x)).T,
-                                                ca.densify(ca.jacobian(V(x, t), t))])
+    at = Arguments.of(V)
+    value, (x, t) = at.call(V), at.inputs
+    gradient = at.function("gradient", {"V": value, "V_x": ca.densify(ca.jacobian(value, x)).T,
+                                        "V_t": ca.densify(ca.jacobian(value, t))})
 
     def derivatives(x: Array, t: Array) -> tuple[Array, Array, Array]:
         B, n, nx = x.shape
@@ -148,10 +150,9 @@ def _derivatives(V: ca.Function) -> Callable[[Array, Array], tuple[Array, Array,
 
 def _hamiltonian_gradient(ocp: OCP) -> ca.Function:
     """(x, u, costate) -> L_u + f_u' costate."""
-    s = ocp.system
-    costate = ca.SX.sym("costate", s.nx)
-    H = ocp.running + ca.dot(costate, s.f(s.x, s.u))
-    return ca.Function("H_u", [s.x, s.u, costate], [ca.densify(ca.gradient(H, s.u))])
+    at, costate = ocp.functions.stage, ca.SX.sym("costate", ocp.system.nx)
+    H_u = ca.gradient(at.hamiltonian(costate, soft=False), at.u)
+    return at.function("H_u", {"H_u": ca.densify(H_u)}, costate=costate)
 
 
 def _free(ocp: OCP, u: Array, slope: Array) -> Array:

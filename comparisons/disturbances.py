@@ -83,10 +83,7 @@ def plant(ocp: OCP, variant: Any) -> ca.Function:
 
 def on_plant(ocp: OCP, f: ca.Function) -> OCP:
     """The problem with another f: cost, goal and constraints stay."""
-    s = ocp.system
-    if not f.is_a("SXFunction"):
-        f = f.expand()
-    return replace(ocp, system=replace(s, xdot=f(s.x, s.u)))
+    return replace(ocp, system=ocp.system.under(f))
 
 
 def _spread(value: Any, nx: int, name: str) -> Array:
@@ -142,9 +139,9 @@ class _Study:
 
     def wrong(self) -> dict[str, ca.Function]:
         """A model that is wrong in structure's place: what a control does."""
-        s, share = self.ocp.system, self.settings.weaker
-        x, u, centre = s.x, s.u, ca.DM(self.ocp.u_goal)
-        weak = ca.Function("weak", [x, u], [s.f(x, centre + (1 - share) * (u - centre))])
+        share, of, centre = self.settings.weaker, self.ocp.functions, ca.DM(self.ocp.u_goal)
+        at = of.stage
+        weak = at.function("weak", {"xdot": at.given(u=centre + (1 - share) * (at.u - centre)).call(of.f)})
         return {f"controls {100 * share:g} % weaker": weak} if share else {}
 
     def anew(self, f: ca.Function, u: Array, guesses: Sequence[Array]) -> Array:

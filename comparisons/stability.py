@@ -26,7 +26,6 @@ from nocl.ocp import OCP
 from nocl.solvers.ddp.solver import DDP
 from nocl.solvers.lqr import LQR
 from nocl.support.checks import Array
-from nocl.translate.rk4 import rk4
 
 LATE, MIDDLE = 0.99, 0.5  # of the horizon
 POINTS = 8  # best known trajectories that mid-horizon is looked at on
@@ -55,11 +54,11 @@ def stability(report: Report, methods: Mapping[str, Any]) -> tuple[Stability, ..
 def local(ocp: OCP, name: str, policy: ca.Function, where: str, t: float, x: Array) -> Stability | None:
     """A policy at points x [P, nx] and time t."""
     s = ocp.system
-    state, time = ca.MX.sym("x", s.nx), ca.MX.sym("t")
-    u = ca.fmin(ca.fmax(policy(state, time), s.lbu), s.ubu)
-    xdot = s.f(state, u)
-    loop = ca.Function("loop", [state, time], [xdot, ca.densify(ca.jacobian(xdot, state)),
-                                               ca.densify(ca.jacobian(u, state))])
+    at = ocp.functions.feedback(ca.MX)
+    u = ca.fmin(ca.fmax(policy(*at.inputs), s.lbu), s.ubu)
+    xdot = at.given(u=u).call(ocp.functions.f)
+    loop = at.function("loop", {"xdot": xdot, "A": ca.densify(ca.jacobian(xdot, at["x"])),
+                                "K": ca.densify(ca.jacobian(u, at["x"]))})
     parts = [loop(row, t) for row in x]
     A, K = (np.array([part[i].full() for part in parts]) for i in (1, 2))
     if not np.isfinite(A).all():
@@ -124,7 +123,8 @@ def _optimum(report: Report) -> list[Stability]:
     if not len(found):
         return []
     k, h = K // 2, ocp.horizon / K
-    jacobians = [ocp.system.linearize(found.x[i, k], found.u[i, k]) for i in range(len(found))]
+    linear = ocp.functions.jacobian
+    jacobians = [[j.full() for j in linear(found.x[i, k], found.u[i, k])] for i in range(len(found))]
     A = np.array([A + B @ found.gain[i, k] for i, (A, B) in enumerate(jacobians)])
     growth = np.array([np.linalg.norm(_transition(ocp, found.x[i, k:], found.u[i, k:], found.gain[i, k:], h), 2)
                        for i in range(len(found))])
@@ -133,10 +133,10 @@ def _optimum(report: Report) -> list[Stability]:
 
 def _transition(ocp: OCP, x: Array, u: Array, gain: Array, h: float) -> Array:
     """The product of the closed loop's Jacobians over RK4 steps of length h, [nx, nx]."""
-    s = ocp.system
-    after = rk4(s.f, s.x, s.u, h)
-    step = ca.Function("step", [s.x, s.u], [ca.densify(ca.jacobian(after, s.x)), ca.densify(ca.jacobian(after, s.u))])
-    Phi = np.eye(s.nx)
+    at = ocp.functions.stage
+    after, _ = at.interval(h)
+    step = at.function("step", {"A": ca.densify(ca.jacobian(after, at.x)), "B": ca.densify(ca.jacobian(after, at.u))})
+    Phi = np.eye(ocp.system.nx)
     for k in range(len(u)):
         by_x, by_u = (j.full() for j in step(x[k], u[k]))
         Phi = (by_x + by_u @ gain[k]) @ Phi

@@ -1,4 +1,5 @@
-"""The Hamiltonian's minimiser over the box U, derived from an OCP's own symbols: u*(x, p) = argmin L(x, u) + p'f(x, u).
+"""The Hamiltonian's minimiser over the box U, derived from an OCP's own symbols: u*(x, p) = argmin L(x, u) + p'f(x, u),
+p the costate.
 
 Where H is quadratic in u (f affine or bilinear in u, L quadratic) the minimum over the box is known exactly, convex or
 not: it lies at the stationary point of one of the box's faces (a corner, an edge, ..., the inside), and with H
@@ -8,6 +9,7 @@ separable in u each control is found by itself. The answer is one SX function, s
 from __future__ import annotations
 
 import itertools
+from typing import Any
 
 import casadi as ca
 
@@ -17,22 +19,19 @@ FACES = 4  # most controls that are coupled in H for all 3^nu faces to be writte
 
 
 def hamiltonian(ocp: OCP) -> ca.Function:
-    """(x, u, p) -> H = L + p'f with path constraints as OCP.L_soft has them, a scalar."""
-    s = ocp.system
-    p = ca.SX.sym("p", s.nx)
-    H = ocp.L_soft(s.x, s.u) + ca.dot(p, s.equations)
-    return ca.Function("hamiltonian", [s.x, s.u, p], [H], ["x", "u", "p"], ["H"])
+    """(x, u, costate) -> H = L + costate'f with path constraints as OCP.L_soft has them, a scalar."""
+    at, costate = ocp.functions.stage, ca.SX.sym("costate", ocp.system.nx)
+    return at.function("hamiltonian", {"H": at.hamiltonian(costate)}, costate=costate)
 
 
 def minimiser(ocp: OCP) -> ca.Function | None:
-    """(x, p) -> (u*, H(x, u*, p)), exact; None where H is not quadratic in u, or couples more than FACES controls."""
-    s = ocp.system
-    p = ca.SX.sym("p", s.nx)
-    H = hamiltonian(ocp)(s.x, s.u, p)
-    Q, g = ca.hessian(H, s.u)
-    if ca.depends_on(Q, s.u):
+    """(x, costate) -> (u*, H there), exact; None where H is not quadratic in u, or couples more than FACES controls."""
+    s, at, costate = ocp.system, ocp.functions.stage, ca.SX.sym("costate", ocp.system.nx)
+    H: Any = at.hamiltonian(costate)
+    Q, g = ca.hessian(H, at.u)
+    if ca.depends_on(Q, at.u):
         return None
-    rest, g = (ca.substitute(e, s.u, ca.SX.zeros(s.nu)) for e in (H, g))
+    rest, g = (ca.substitute(e, at.u, ca.SX.zeros(s.nu)) for e in (H, g))
     quadratic = _Quadratic(ca.densify(Q), ca.densify(g), s.lbu, s.ubu)
     if not Q.sparsity().is_diag():
         if s.nu > FACES:
@@ -40,13 +39,13 @@ def minimiser(ocp: OCP) -> ca.Function | None:
         u = quadratic.over_faces()
     else:
         u = ca.vertcat(*map(quadratic.alone, range(s.nu)))
-    return ca.Function("minimiser", [s.x, p], [u, rest + quadratic.value(u)], ["x", "p"], ["u", "H"])
+    return at.but("u").function("minimiser", {"u": u, "H": rest + quadratic.value(u)}, costate=costate)
 
 
 class _Quadratic:
     """g'u + u'Qu / 2 on the box."""
 
-    def __init__(self, Q: ca.SX, g: ca.SX, lb: ca.DM, ub: ca.DM) -> None:
+    def __init__(self, Q: Any, g: Any, lb: ca.DM, ub: ca.DM) -> None:
         self.Q, self.g, self.lb, self.ub = Q, g, ca.DM(lb), ca.DM(ub)
 
     def value(self, u: ca.SX) -> ca.SX:

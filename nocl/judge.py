@@ -99,15 +99,16 @@ def check_made_for(ocp: OCP, thing: Any, what: str) -> None:
 
 
 def dynamics_function(ocp: OCP, f: Any) -> ca.Function:
-    """f as a casadi.Function (x, u) -> xdot: the exact one for None, a Function, or what `to_casadi()` returns."""
+    """f as a casadi.Function (x, u) -> xdot, its inputs under these names: the exact one for None, a Function, or what
+    `to_casadi()` returns."""
     s = ocp.system
     if f is None:
-        return s.f
+        return ocp.functions.f
     g = f if isinstance(f, ca.Function) else _converted(f)
     if g is None:
         raise ValueError(f"the dynamics are a {type(f).__name__}; expected a casadi.Function (x, u) -> xdot, "
                          "an object with to_casadi(), or None for the exact f")
-    return _with_sizes(g, (s.nx, s.nu), s.nx, "the dynamics", "(x, u) -> xdot", s.name)
+    return ocp.functions.on(_with_sizes(g, (s.nx, s.nu), s.nx, "the dynamics", "(x, u) -> xdot", s.name)).f
 
 
 def policy_function(ocp: OCP, controller: Any) -> ca.Function | None:
@@ -115,8 +116,8 @@ def policy_function(ocp: OCP, controller: Any) -> ca.Function | None:
     s = ocp.system
     g = controller if isinstance(controller, ca.Function) else _converted(controller)
     if g is not None and [g.numel_in(i) for i in range(g.n_in())] == [s.nx]:
-        x, t = ca.MX.sym("x", s.nx), ca.MX.sym("t")
-        g = ca.Function(g.name(), [x, t], [g(x if g.size2_in(0) == 1 else x.T)], ["x", "t"], ["u"])
+        at = ocp.functions.feedback(ca.MX)
+        g = at.function(g.name(), {"u": g(at["x"] if g.size2_in(0) == 1 else at["x"].T)})
     return g if g is None else _with_sizes(g, (s.nx, 1), s.nu, "the policy", "(x, t) -> u", s.name)
 
 

@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from nocl import pretty, sampling
+from nocl.functions import Functions
 from nocl.sampling import Distribution, Gaussian, Uniform, short
 from nocl.smoothness import kinks, linear_controls
 from nocl.support import checks
@@ -153,13 +154,16 @@ class OCP:
             return ()
         rng = np.random.default_rng(0)
         x, u = rng.uniform(s.lbx, s.ubx, (N_IMAGES, s.nx)).T, rng.uniform(s.lbu, s.ubu, (N_IMAGES, s.nu)).T
-        all_of = ca.Function("all", [s.x, s.u], [ca.vertcat(s.xdot, self.running, self.terminal,
-                                                            *self.path_constraints.values())])
-        here = all_of(x, u).full()
+        of = self.functions
+
+        def values(x: Array) -> Array:
+            return np.vstack([v.full() for v in (of.f(x, u), of.L(x, u), of.G(x), of.h(x))])
+
+        here = values(x)
         usual = np.abs(here).max(axis=1, keepdims=True)
         turn = 2 * np.pi * np.eye(s.nx)
         return tuple(i for i in s.angle_indices
-                     if (np.abs(all_of(x + turn[:, [i]], u).full() - here) <= SAME_IMAGE * usual).all())
+                     if (np.abs(values(x + turn[:, [i]]) - here) <= SAME_IMAGE * usual).all())
 
     def from_goal(self, x: Any) -> Any:
         """x - x*, from the nearest image of the goal: numpy rows [..., nx], or a CasADi column [nx]."""
@@ -199,28 +203,33 @@ class OCP:
                    x_goal=x_goal, u_goal=u_goal, **options)
 
     @cached_property
-    def L(self) -> ca.Function:
-        """(x, u) -> running cost, a scalar."""
-        return ca.Function("L", [self.system.x, self.system.u], [self.running], ["x", "u"], ["L"])
-
-    @cached_property
-    def G(self) -> ca.Function:
-        """x -> terminal cost, a scalar."""
-        return ca.Function("G", [self.system.x], [self.terminal], ["x"], ["G"])
-
-    @cached_property
-    def h(self) -> ca.Function:
-        """x -> path constraints [number of them], each >= 0 where it holds."""
-        h = ca.vertcat(ca.SX(0, 1), *self.path_constraints.values())
-        return ca.Function("h", [self.system.x], [h], ["x"], ["h"])
-
-    @cached_property
-    def L_soft(self) -> ca.Function:
-        """(x, u) -> running cost plus penalty * sum of max(margin - h(x), 0)^2: L itself without path constraints."""
+    def functions(self) -> Functions:
+        """f, L, L_soft, h, G, their derivatives, and symbols to build more of them on: the one door to them all."""
         soft = self.running
         for h in self.path_constraints.values():
-            soft += self.penalty * ca.fmax(self.penalty_margin - h, 0) ** 2
-        return ca.Function("L_soft", [self.system.x, self.system.u], [soft], ["x", "u"], ["L"])
+            soft = soft + self.penalty * ca.fmax(self.penalty_margin - h, 0) ** 2
+        h = ca.vertcat(ca.SX(0, 1), *self.path_constraints.values())
+        return Functions(self.system, self.running, soft, h, self.terminal)
+
+    @property
+    def L(self) -> ca.Function:
+        """(x, u) -> running cost, a scalar."""
+        return self.functions.L
+
+    @property
+    def G(self) -> ca.Function:
+        """x -> terminal cost, a scalar."""
+        return self.functions.G
+
+    @property
+    def h(self) -> ca.Function:
+        """x -> path constraints [number of them], each >= 0 where it holds."""
+        return self.functions.h
+
+    @property
+    def L_soft(self) -> ca.Function:
+        """(x, u) -> running cost plus penalty * sum of max(margin - h(x), 0)^2: L itself without path constraints."""
+        return self.functions.L_soft
 
     def __repr__(self) -> str:
         z = ca.vertcat(self.system.x, self.system.u)

@@ -136,8 +136,8 @@ def split_controls(system: System, names: Sequence[str]) -> System:
     if unknown or isinstance(names, str):
         raise ValueError(f"split_controls: got {names!r}; expected a list of names of controls "
                          f"({', '.join(system.control_names)})")
-    parts, value, lb, ub = list[ca.SX](), list[ca.SX](), list[float](), list[float]()
-    for name, u, low, high in zip(system.control_names, ca.vertsplit(system.u), system.lbu, system.ubu, strict=True):
+    parts, value, lb, ub, at = list[ca.SX](), list[ca.SX](), list[float](), list[float](), system.arguments
+    for name, u, low, high in zip(system.control_names, ca.vertsplit(at["u"]), system.lbu, system.ubu, strict=True):
         if name not in names:
             parts, value, lb, ub = [*parts, u], [*value, u], [*lb, low], [*ub, high]
             continue
@@ -149,6 +149,6 @@ def split_controls(system: System, names: Sequence[str]) -> System:
     units = {n: unit for n, unit in system.units.items() if n not in names}
     units |= {f"{n}_{side}": system.units[n] for n, side in itertools.product(names, ("plus", "minus"))
               if n in system.units}
-    xdot = system.f(system.x, ca.vertcat(*value))
-    return System(f"{system.name}_split", x=system.x, u=ca.vertcat(*parts), xdot=xdot, lbu=lb, ubu=ub, lbx=system.lbx,
+    xdot = at.given(u=ca.vertcat(*value)).call(system.f)
+    return System(f"{system.name}_split", x=at["x"], u=ca.vertcat(*parts), xdot=xdot, lbu=lb, ubu=ub, lbx=system.lbx,
                   ubx=system.ubx, angles=system.angles, units=units)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any
@@ -17,6 +17,7 @@ from nocl import pretty
 from nocl.support import checks
 from nocl.support.checks import MALFORMED, Array, Vector
 from nocl.translate import instructions
+from nocl.translate.arguments import Arguments
 
 N_SAME, SAME = 16, 1e-9  # points, and relative to usual values: equations that agree so far are the same
 N_PROBES = 512  # points of the box at which the equations are tried on construction
@@ -147,15 +148,20 @@ class System:
         return self.xdot
 
     @cached_property
+    def arguments(self) -> Arguments:
+        """(x, u), the system's own symbols: what xdot is a function of."""
+        return Arguments({"x": self.x, "u": self.u})
+
+    @cached_property
     def f(self) -> ca.Function:
         """(x [nx], u [nu]) -> xdot [nx]."""
-        return ca.Function("f", [self.x, self.u], [self.equations], ["x", "u"], ["xdot"])
+        return self.arguments.function("f", {"xdot": self.equations})
 
     @cached_property
     def jacobian(self) -> ca.Function:
         """(x, u) -> (A [nx, nx] = df/dx, B [nx, nu] = df/du), dense."""
         A, B = (ca.densify(ca.jacobian(self.equations, v)) for v in (self.x, self.u))
-        return ca.Function("jacobian", [self.x, self.u], [A, B], ["x", "u"], ["A", "B"])
+        return self.arguments.function("jacobian", {"A": A, "B": B})
 
     def linearize(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
         """(A, B) at (x, u), as numpy arrays [nx, nx] and [nx, nu]."""
@@ -178,6 +184,11 @@ class System:
         usual = np.abs(own).max(axis=1, keepdims=True)
         rows = np.flatnonzero((~(np.abs(theirs - own) <= SAME * (usual + np.abs(own)))).any(axis=1))
         return "its equation(s) of " + ", ".join(self.state_names[i] for i in rows) + " are others" if rows.size else ""
+
+    def under(self, f: ca.Function) -> System:
+        """The system with another f:(x, u) -> xdot for its equations, in its own symbols: f is written out in SX."""
+        f = f if f.is_a("SXFunction") else f.expand()
+        return replace(self, xdot=f(*self.arguments.inputs))
 
     def unit(self, name: str) -> str:
         """The unit of a state or control for an axis label, like 'theta [rad]' or just 'theta'."""

@@ -39,7 +39,7 @@ class LQR:
     def __init__(self, ocp: OCP, infinite: bool = False) -> None:
         checks.problem(ocp, "LQR")
         self.ocp, self.infinite = ocp, infinite
-        self.A, self.B = ocp.system.linearize(ocp.x_goal, ocp.u_goal)
+        self.A, self.B = (j.full() for j in ocp.functions.jacobian(ocp.x_goal, ocp.u_goal))
         self.Q, self.R, self.S, self.P_final = _hessians(ocp)
         _check_equilibrium(ocp)
         if np.linalg.eigvalsh(self.R).min() <= 0:
@@ -121,35 +121,32 @@ class LQR:
     def to_casadi(self) -> ca.Function:
         """policy:(x, t) -> u, the same controller in MX."""
         s, n = self.ocp.system, len(self.A)
-        x, t = ca.MX.sym("x", s.nx), ca.MX.sym("t")
+        at = self.ocp.functions.feedback(ca.MX)
         P: Any = ca.DM(self.P(0.0))
         if not self.infinite:
             spline = self._spline
-            inside = ca.fmin(ca.fmax(t, 0.0), self.ocp.horizon)
+            inside = ca.fmin(ca.fmax(at["t"], 0.0), self.ocp.horizon)
             entries = ca.bspline(inside, spline.c.ravel().tolist(), [spline.t.tolist()], [DEGREE], n * n, {})
             P = ca.reshape(entries, n, n)
             P = (P + P.T) / 2
         K = ca.mtimes(ca.DM(np.linalg.inv(self.R)), ca.mtimes(self.B.T, P) + self.S.T)
-        u = self.ocp.u_goal - ca.mtimes(K, self.ocp.from_goal(x))
-        return ca.Function("policy", [x, t], [ca.fmin(ca.fmax(u, s.lbu), s.ubu)], ["x", "t"], ["u"])
+        u = self.ocp.u_goal - ca.mtimes(K, self.ocp.from_goal(at["x"]))
+        return at.function("policy", {"u": ca.fmin(ca.fmax(u, s.lbu), s.ubu)})
 
 
 def _hessians(ocp: OCP) -> tuple[Array, Array, Array, Array]:
     """(Q, R, S [nx, nu], Hessian of G) at the goal pair."""
-    s = ocp.system
-    H, _ = ca.hessian(ocp.running, ca.vertcat(s.x, s.u))
-    H_G, _ = ca.hessian(ocp.terminal, s.x)
-    at = ca.Function("hessians", [s.x, s.u], [ca.densify(H), ca.densify(H_G)])
-    H, P = (m.full() for m in at(ocp.x_goal, ocp.u_goal))
-    return H[: s.nx, : s.nx], H[s.nx:, s.nx:], H[: s.nx, s.nx:], P
+    n = ocp.system.nx
+    H = ocp.functions.L_derivatives(ocp.x_goal, ocp.u_goal)[2].full()
+    P = ocp.functions.G_derivatives(ocp.x_goal)[2].full()
+    return H[:n, :n], H[n:, n:], H[:n, n:], P
 
 
 def _check_equilibrium(ocp: OCP) -> None:
-    s = ocp.system
-    gradients = ca.Function("gradients", [s.x, s.u], [ca.densify(ca.gradient(ocp.running, ca.vertcat(s.x, s.u))),
-                                                      ca.densify(ca.gradient(ocp.terminal, s.x))])
-    L_z, G_x = (g.full().ravel() for g in gradients(ocp.x_goal, ocp.u_goal))
-    f = s.f(ocp.x_goal, ocp.u_goal).full().ravel()
+    s, of = ocp.system, ocp.functions
+    L_z = of.L_derivatives(ocp.x_goal, ocp.u_goal)[1].full().ravel()
+    G_x = of.G_derivatives(ocp.x_goal)[1].full().ravel()
+    f = of.f(ocp.x_goal, ocp.u_goal).full().ravel()
     for what, values, names in (("f", f, s.state_names), ("the gradient of L", L_z, s.names),
                                 ("the gradient of G", G_x, s.state_names)):
         i = int(np.argmax(np.abs(values)))

@@ -38,6 +38,7 @@ from nocl.support import checks, store
 from nocl.support.checks import Array
 from nocl.support.fields import Checked, coefficients, count, flag, positive
 from nocl.support.threads import one_thread
+from nocl.translate.arguments import Arguments
 from nocl.translate.fused import FusedFunction
 from nocl.translate.rk4 import rk4
 from nocl.translate.torch_functions import to_torch
@@ -107,8 +108,8 @@ class ValueNet(nn.Module):
     def to_casadi(self) -> tuple[ca.Function, ca.Function]:
         """(value:(x, t) -> V, value_gradient:(x, t) -> V_x), native MX."""
         dm = {name: ca.DM(p.detach().double().numpy()) for name, p in self.named_parameters()}
-        x, t = ca.MX.sym("x", self.opening.in_features - 1), ca.MX.sym("t")
-        s, share = ca.vertcat(x, t), 1 / len(self.residual)
+        at = Arguments.new(ca.MX, x=self.opening.in_features - 1, t=1)
+        s, share = ca.vertcat(*at.inputs), 1 / len(self.residual)
         a = [ca.mtimes(dm["opening.weight"], s) + dm["opening.bias"]]
         r = _sigma_mx(a[0])
         for i in range(len(self.residual)):
@@ -119,8 +120,8 @@ class ValueNet(nn.Module):
         for i in reversed(range(len(self.residual))):
             z = z + share * ca.mtimes(dm[f"residual.{i}.weight"].T, ca.tanh(a[i + 1]) * z)
         g = ca.mtimes(dm["opening.weight"].T, ca.tanh(a[0]) * z) + ca.mtimes(dm["A"].T, As) + dm["b"]
-        return (ca.Function("value", [x, t], [self.scale * V], ["x", "t"], ["V"]),
-                ca.Function("value_gradient", [x, t], [self.scale * g[:-1]], ["x", "t"], ["V_x"]))
+        return (at.function("value", {"V": self.scale * V}),
+                at.function("value_gradient", {"V_x": self.scale * g[:-1]}))
 
     def sizes(self) -> dict[str, Any]:
         """What it was constructed with."""
@@ -185,9 +186,9 @@ class NeuralOC:
 
     def to_casadi(self) -> ca.Function:
         """policy:(x [nx], t) -> (u [nu]), native MX."""
-        x, t = ca.MX.sym("x", self.ocp.system.nx), ca.MX.sym("t")
-        u = self._minimiser(x, self.value_net.to_casadi()[1](x, t))
-        return ca.Function("policy", [x, t], [ca.densify(u)], ["x", "t"], ["u"])
+        at = self.ocp.functions.feedback(ca.MX)
+        u = at.given(costate=at.call(self.value_net.to_casadi()[1])).call(self._minimiser)
+        return at.function("policy", {"u": ca.densify(u)})
 
     def value_to_casadi(self) -> ca.Function:
         """value:(x [nx], t) -> (V), native MX."""
@@ -344,34 +345,36 @@ class _Trainer:
 
 
 def _minimiser(ocp: OCP) -> ca.Function:
-    """(x, p) -> u*(x, p), in SX."""
+    """(x, costate) -> u*, in SX."""
     function = minimiser(ocp)
     if function is None:
         raise ValueError(f"NeuralOC of {ocp.system.name!r}: its Hamiltonian L + p'f has no minimiser in closed form; "
                          "expected one quadratic in u that couples at most 4 controls: use nocl.train or NMPC")
-    x, p = ocp.system.x, ca.SX.sym("p", ocp.system.nx)
-    return ca.Function("u", [x, p], [function(x, p)[0]], ["x", "p"], ["u"])
+    at = Arguments.of(function)
+    return at.function("u", {"u": at.call(function)[0]})
 
 
 def _characteristics(ocp: OCP) -> ca.Function:
-    """(x, p) in one vector -> (f, L, H) at u*(x, p)."""
-    s, p = ocp.system, ca.SX.sym("p", ocp.system.nx)
-    u = _minimiser(ocp)(s.x, p)
-    f, L = s.f(s.x, u), ocp.L_soft(s.x, u)
-    return ca.Function("characteristics", [ca.vertcat(s.x, p)], [ca.vertcat(f, L, L + ca.dot(p, f))])
+    """(x, costate) in one vector -> (f, L, H) at u*(x, costate)."""
+    best = _minimiser(ocp)
+    at = Arguments.of(best)
+    here = at.given(u=at.call(best))
+    f, L = here.call(ocp.functions.f), here.call(ocp.functions.L_soft)
+    return ca.Function("characteristics", [ca.vertcat(*at.inputs)], [ca.vertcat(f, L, L + ca.dot(at["costate"], f))])
 
 
 def _terminal(ocp: OCP) -> ca.Function:
     """x -> (G, G_x)."""
-    x, G = ocp.system.x, ocp.terminal
-    return ca.Function("terminal", [x], [ca.densify(ca.vertcat(G, ca.gradient(G, x)))])
+    at = ocp.functions.end
+    G, G_x, _ = at.call(ocp.functions.G_derivatives)
+    return at.function("terminal", {"G": ca.vertcat(G, G_x)})
 
 
 def _scale(ocp: OCP) -> float:
     """Half the mean curvature of L in u at the goal: the weight of ||u||^2."""
     s = ocp.system
-    H, _ = ca.hessian(ocp.running, s.u)
-    curvature = np.linalg.eigvalsh(ca.Function("H", [s.x, s.u], [ca.densify(H)])(ocp.x_goal, ocp.u_goal).full())
+    L_zz = ocp.functions.L_derivatives(ocp.x_goal, ocp.u_goal)[2].full()
+    curvature = np.linalg.eigvalsh(L_zz[s.nx:, s.nx:])
     if curvature.min() <= 0:
         raise ValueError(f"NeuralOC of {s.name!r}: the Hessian of L in u has the eigenvalues {curvature.tolist()} at "
                          "the goal; expected > 0, or u* jumps and nothing is learned through it: add a cost on each "

@@ -188,7 +188,7 @@ def _car(ocp: OCP) -> tuple[float, float, float]:
         raise ValueError(f"{remedy} has {s.nx} states and {s.nu} controls: use NMPC, DDP or nocl.train")
     rng = np.random.default_rng(0)
     x, u = rng.uniform(s.lbx, s.ubx, (PROBES, 3)), rng.uniform(s.lbu, s.ubu, (PROBES, 2))
-    f, psi, v, alpha = s.f(x.T, u.T).full(), x[:, 2], u[:, 0], u[:, 1]
+    f, psi, v, alpha = ocp.functions.f(x.T, u.T).full(), x[:, 2], u[:, 0], u[:, 1]
     curvature = float(f[2] @ (v * alpha) / ((v * alpha) @ (v * alpha)))
     car = np.array([v * np.cos(psi), v * np.sin(psi), curvature * v * alpha])
     if curvature <= 0 or not np.allclose(f, car, rtol=1e-9, atol=1e-9):

@@ -83,7 +83,7 @@ def test_fused_steps_are_the_torch_steps_with_the_same_gradients(problem):
     x0[0, :2] = [-1.0, 0.1]  # inside the obstacle of dubins
     x0 = torch.as_tensor(x0).reshape(3, 2, -1).requires_grad_()
     answers = []
-    for step in (rk4_cost, FusedStep(ocp.system.f, ocp.L_soft)):
+    for step in (rk4_cost, FusedStep(ocp.functions.step())):
         path = hjb.rollout(policy, f, L, x0, 0.5, 4, step=step)
         loss = path.running.sum() + (path.x * torch.arange(1.0, 1 + ocp.system.nx)).sin().sum()
         answers.append([path.x, path.running, *torch.autograd.grad(loss, [x0, *policy.parameters()])])

@@ -150,8 +150,9 @@ def plane(report: Results) -> list[int]:
     s, moved = report.ocp.system, _moved(report)
     if s.nx == 1:
         return [0, 1]
+    at = report.ocp.functions.stage
     pairs = [] if s.xdot is None else [(i, k) for i in range(s.nx) for k in range(s.nx) if i != k
-                                       and ca.is_equal(s.xdot[i], s.x[k], 0)]
+                                       and ca.is_equal(at.xdot[i], at.x[k], 0)]
     best = max(pairs, key=lambda pair: moved[pair[0]], default=None)
     return list(best) if best else sorted(np.argsort(-moved, kind="stable")[:2].tolist())
 
@@ -181,8 +182,9 @@ def visited(report: Results) -> tuple[Array, Array]:
 def _obstacle_pairs(ocp: OCP) -> dict[tuple[int, int], list[int]]:
     """Path constraints by the two coordinates that they depend on, where it is two."""
     pairs: dict[tuple[int, int], list[int]] = {}
-    for c, h in enumerate(ocp.path_constraints.values()):
-        on = [k for k in range(ocp.system.nx) if ca.depends_on(h, ocp.system.x[k])]
+    x = ocp.functions.node["x"]
+    for c, h in enumerate(ca.vertsplit(ocp.functions.constraints)):
+        on = [k for k in range(ocp.system.nx) if ca.depends_on(h, x[k])]
         if len(on) == 2:
             pairs.setdefault((on[0], on[1]), []).append(c)
     return pairs

@@ -147,7 +147,7 @@ def rollout_ms(ocp: OCP, controller: Callable[[Array, float], Array], x0: Array)
     """
     from nocl.support.threads import one_thread
 
-    x, h, f = x0, ocp.horizon / INTERVALS, ocp.system.f
+    x, h, f = x0, ocp.horizon / INTERVALS, ocp.functions.f
     with one_thread():
         controller(x, 0.0)
         start = time.perf_counter()

@@ -14,7 +14,6 @@ from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.support.packages import package
 from nocl.system import System
-from nocl.translate.rk4 import rk4_cost
 
 
 def to_control(system: System, x: ArrayLike | None = None, u: ArrayLike | None = None) -> Any:
@@ -57,7 +56,7 @@ def to_acados(system: System) -> Any:
         model = package("acados_template").AcadosModel()
     except ValueError as error:
         raise ValueError(f"{error}, or acados' own interfaces/acados_template") from None
-    model.name, model.x, model.u = system.name, ca.SX(system.x), ca.SX(system.u)
+    model.name, (model.x, model.u) = system.name, (ca.SX(v) for v in system.arguments.inputs)
     model.xdot = ca.SX.sym("xdot", system.nx)
     model.f_expl_expr = system.f(model.x, model.u)
     model.f_impl_expr = model.xdot - model.f_expl_expr
@@ -85,23 +84,23 @@ def to_gymnasium(ocp: OCP, *, steps: int = 80, integrator: str = "rk4", observe_
 
 def _step(ocp: OCP, h: float, integrator: str) -> Callable[[Array, Array], tuple[Array, float]]:
     """(x, u) -> (x after h, the integral of L)."""
-    s = ocp.system
     if integrator == "rk4":
-        x, u = ca.SX.sym("x", s.nx), ca.SX.sym("u", s.nu)
-        function = ca.Function("step", [x, u], list(rk4_cost(s.f, ocp.L, x, u, h)))
-    else:
-        z, u = ca.SX.sym("z", s.nx + 1), ca.SX.sym("u", s.nu)
-        dae = {"x": z, "p": u, "ode": ca.vertcat(s.f(z[:-1], u), ocp.L(z[:-1], u))}
-        judge = ca.integrator("step", "cvodes", dae, 0.0, h, {"reltol": 1e-9, "abstol": 1e-10})
-        start, held = ca.MX.sym("x", s.nx), ca.MX.sym("u", s.nu)
-        end: Any = judge(x0=ca.vertcat(start, 0), p=held)["xf"]
-        function = ca.Function("step", [start, held], [end[:-1], end[-1]])
+        function = ocp.functions.step(soft=False)
 
-    def step(x: Array, u: Array) -> tuple[Array, float]:
-        after, cost = function(x, u)
-        return after.full().ravel(), float(cost)
+        def rk4(x: Array, u: Array) -> tuple[Array, float]:
+            after, cost = function(x, u, h)
+            return after.full().ravel(), float(cost)
 
-    return step
+        return rk4
+    at = ocp.functions.stage
+    z, ode = ca.vertcat(at.x, at.sym("cost")), ca.vertcat(at.xdot, at.L)
+    judge = ca.integrator("step", "cvodes", {"x": z, "p": at.u, "ode": ode}, 0.0, h, {"reltol": 1e-9, "abstol": 1e-10})
+
+    def cvodes(x: Array, u: Array) -> tuple[Array, float]:
+        end = judge(x0=np.r_[x, 0.0], p=u)["xf"].full().ravel()
+        return end[:-1], float(end[-1])
+
+    return cvodes
 
 
 def _environment(gymnasium: Any, ocp: OCP, steps: int, step: Callable[[Array, Array], tuple[Array, float]],

@@ -90,8 +90,7 @@ class LearnedDynamics:
 
         SX of all networks: for small ones, as logs teach them.
         """
-        f, s = self.to_casadi().expand(), self.system
-        return replace(s, xdot=f(s.x, s.u))
+        return self.system.under(self.to_casadi())
 
     def validate(self, log: Log, steps: Sequence[int] = HORIZONS, *, every: int | None = None) -> Validation:
         """Errors of simulations of f_theta from a log's states, by number of steps: see nocl.validation."""

@@ -263,12 +263,11 @@ def _mlp(weights: fitting.Weights) -> MLP:
 def assemble(parts: Structure, weights: Sequence[fitting.Weights], angles: bool) -> FeatureNet:
     """f_theta: features, the groups' networks, and the known part with the affine controls as the output map."""
     box = parts.split.box
-    x, u = ca.SX.sym("x", box.nx), ca.SX.sym("u", box.nz - box.nx)
-    z = ca.vertcat(x, u)
+    at = box.arguments()
+    z = ca.vertcat(*at.inputs)
     phi = [ca.vertcat(*_features(box, g, z, angles)[0]) for g in parts.groups]
-    y = [ca.SX.sym(f"y{i}", len(g.coefficients)) for i, g in enumerate(parts.groups)]
-    learned = {c: a[j] for g, a in zip(parts.groups, y, strict=True) for j, c in enumerate(g.coefficients)}
-    inputs = ca.Function("features", [x, u], phi, ["x", "u"], [f"phi{i}" for i in range(len(phi))])
-    names = ["x", "u", *(f"y{i}" for i in range(len(y)))]
-    outputs = ca.Function("xdot", [x, u, *y], [parts.xdot(learned, z)], names, ["xdot"])
+    y = {f"y{i}": ca.SX.sym(f"y{i}", len(g.coefficients)) for i, g in enumerate(parts.groups)}
+    learned = {c: a[j] for g, a in zip(parts.groups, y.values(), strict=True) for j, c in enumerate(g.coefficients)}
+    inputs = at.function("features", {f"phi{i}": p for i, p in enumerate(phi)})
+    outputs = at.function("xdot", {"xdot": parts.xdot(learned, z)}, **y)
     return FeatureNet(inputs, [_mlp(w) for w in weights], outputs).eval()

@@ -40,9 +40,9 @@ def train(source: Source, settings: PaperSettings, seed: int, bar: Progress) -> 
     loss = _loss(sizes, settings, labels, torch.from_numpy(np.c_[spread, ratio]))
     theta = parameters_to_vector(mlp.parameters()).detach().clone()
     vector_to_parameters(_adam(theta, loss, settings, len(z), seed, bar), mlp.parameters())
-    x, u, y = ca.SX.sym("x", box.nx), ca.SX.sym("u", box.nz - box.nx), ca.SX.sym("y", box.nx)
-    inputs = ca.Function("features", [x, u], [(ca.vertcat(x, u) - ca.DM(centre)) / ca.DM(unit)], ["x", "u"], ["z"])
-    outputs = ca.Function("xdot", [x, u, y], [ca.DM(mean) + ca.DM(spread) * y], ["x", "u", "y"], ["xdot"])
+    at, y = box.arguments(), ca.SX.sym("y", box.nx)
+    inputs = at.function("features", {"z": (ca.vertcat(*at.inputs) - ca.DM(centre)) / ca.DM(unit)})
+    outputs = at.function("xdot", {"xdot": ca.DM(mean) + ca.DM(spread) * y}, y=y)
     return FeatureNet(inputs, [mlp.double()], outputs).eval()
 
 

@@ -33,7 +33,7 @@ class Stated:
 
         Names of states alone stand for the system's own equations. Raises ValueError for anything else.
         """
-        z, rows = ca.vertcat(system.x, system.u), {}
+        z, rows = ca.vertcat(*system.arguments.inputs), {}
         for name, value in _items(system, known).items():
             if name not in system.state_names:
                 raise ValueError(f"identify: known has {name!r}; expected names of states "
@@ -115,4 +115,4 @@ def _named(system: System, name: str, value: str) -> ca.SX:
     if value not in system.names:
         raise ValueError(f"identify: known[{name!r}] is {value!r}; expected the name of a state or control "
                          f"({', '.join(system.names)}), or an SX expression")
-    return ca.vertcat(system.x, system.u)[system.names.index(value)]
+    return ca.vertcat(*system.arguments.inputs)[system.names.index(value)]

@@ -34,6 +34,7 @@ from numpy.typing import NDArray
 from nocl import pretty
 from nocl.data import Dataset
 from nocl.support.checks import Array
+from nocl.translate.arguments import Arguments
 
 Oracle = Callable[[Array, Array], Dataset]  # x [N, nx], u [N, nu] -> labels with Jacobians
 Labels = Callable[[Array], tuple[Array, Array]]  # z [N, nz] -> values [N, E] and gradients [N, E, nz]
@@ -62,6 +63,10 @@ class Box:
     @property
     def width(self) -> Array:
         return self.ub - self.lb
+
+    def arguments(self) -> Arguments:
+        """(x, u), new SX symbols: what f is a function of."""
+        return Arguments.new(ca.SX, x=self.nx, u=self.nz - self.nx)
 
     def sample(self, n: int, rng: np.random.Generator) -> Array:
         """n uniform rows z [n, nz]."""

@@ -14,7 +14,6 @@ from torch import Tensor
 
 from nocl.support.checks import Array
 from nocl.translate.kernels import Kernel, emit
-from nocl.translate.rk4 import rk4_cost
 
 _CODE = """
 void nocl_step(int64_t first, int64_t last, const int64_t *index, const double *x_, const double *u_, const double *h_,
@@ -48,26 +47,26 @@ void nocl_step_vjp(int64_t first, int64_t last, const int64_t *index, const doub
 """
 
 
-def fused_source(f: ca.Function, L: ca.Function) -> str:
+def fused_source(step: ca.Function) -> str:
     """C of (x, u, h) -> (x after h, integral of L), and of its product with a row from the left."""
-    x, u, h = ca.SX.sym("x", f.size1_in(0)), ca.SX.sym("u", f.size1_in(1)), ca.SX.sym("h")
+    x, u, h = step.sx_in()
     z, bar = ca.vertcat(x, u), ca.SX.sym("bar", x.numel() + 1)
-    after = ca.densify(ca.vertcat(*rk4_cost(f, L, x, u, h)))
+    after: Any = ca.densify(ca.vertcat(*step(x, u, h)))
     vjp = ca.densify(ca.jtimes(after, z, bar, True))
     head = f'#include "lanes.h"\n#define N {x.numel()}\n#define M {u.numel()}\n'
     return head + emit("step", [x, u, h], [after]) + emit("step_vjp", [x, u, h, bar], [vjp]) + _CODE
 
 
 class FusedStep:
-    """A step for `nocl.hjb.rollout` on f:(x, u) -> xdot and L:(x, u); the f and L that it is handed play no part.
+    """A step for `nocl.hjb.rollout` by (x, u, h) -> (end, cost) in SX; the f and L that it is handed play no part.
 
     x [..., nx] and u [..., nu] on the CPU, any float dtype, float64 inside. Differentiable once.
     Raises ValueError where there is no C compiler, or an operation has no C twin.
     """
 
-    def __init__(self, f: ca.Function, L: ca.Function) -> None:
-        self.nx, self.nu = f.size1_in(0), f.size1_in(1)
-        self._kernel = Kernel(fused_source(f, L))
+    def __init__(self, step: ca.Function) -> None:
+        self.nx, self.nu = step.size1_in(0), step.size1_in(1)
+        self._kernel = Kernel(fused_source(step))
 
     def __call__(self, f: Any, L: Any, x: Tensor, u: Tensor, h: float) -> tuple[Tensor, Tensor]:
         after = _Step.apply(x, u, float(h), self)

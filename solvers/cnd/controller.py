@@ -24,6 +24,7 @@ from nocl.solvers.cnd.features import at_rate
 from nocl.solvers.cnd.labels import LONGEST
 from nocl.support import checks
 from nocl.support.checks import Array
+from nocl.translate.arguments import Arguments
 from nocl.translate.torch_functions import to_torch
 
 KIND = "cnd"  # the name of its file in a folder
@@ -98,14 +99,14 @@ class CND:
     def value_gradient_to_casadi(self, backend: str = "native", build_dir: Build = None) -> ca.Function:
         """value_gradient:(x [nx], t) -> (V_x [nx]), the costate, as a CasADi Function."""
         V = self.value_to_casadi(backend, build_dir)
-        x, t = V.mx_in()
-        return ca.Function("value_gradient", [x, t], [ca.densify(ca.jacobian(V(x, t), x)).T], ["x", "t"], ["V_x"])
+        at = Arguments.of(V)
+        return at.function("value_gradient", {"V_x": ca.densify(ca.jacobian(at.call(V), at["x"])).T})
 
     def gain_to_casadi(self, backend: str = "native", build_dir: Build = None) -> ca.Function:
         """gain:(x [nx], t) -> (K [nu, nx]), the linear feedback du = K dx of the closed loop, K = d pi / dx."""
         pi = self.to_casadi(backend, build_dir)
-        x, t = pi.mx_in()
-        return ca.Function("gain", [x, t], [ca.densify(ca.jacobian(pi(x, t), x))], ["x", "t"], ["K"])
+        at = Arguments.of(pi)
+        return at.function("gain", {"K": ca.densify(ca.jacobian(at.call(pi), at["x"]))})
 
     def closed_loop_to_casadi(self, dynamics: Any = None, backend: str = "native",
                               build_dir: Build = None) -> ca.Function:
@@ -114,8 +115,8 @@ class CND:
         dynamics: another f than the exact one, a casadi.Function (x, u) -> xdot or an object with `to_casadi()`.
         """
         pi, f = self.to_casadi(backend, build_dir), dynamics_function(self.ocp, dynamics)
-        x, t = pi.mx_in()
-        return ca.Function("closed_loop", [x, t], [ca.densify(f(x, pi(x, t)))], ["x", "t"], ["xdot"])
+        at = Arguments.of(pi)
+        return at.function("closed_loop", {"xdot": ca.densify(at.given(u=at.call(pi)).call(f))})
 
     def export_parts(self) -> list[Part]:
         """What is exported: policy, gain and closed loop, and value and value gradient where it has a value."""
@@ -127,7 +128,7 @@ class CND:
                 Part("gain", self.gain_to_casadi(), lambda x, t: _slopes(policy, x, t), box, x | {"K": slopes},
                      lean=_lean(self.to_casadi(), "gain", "K"))]
         if s.xdot is not None:  # a plant that is not known has no closed loop to write down
-            f = to_torch(s.f)
+            f = to_torch(self.ocp.functions.f)
             made.append(Part("closed_loop", self.closed_loop_to_casadi(), lambda x, t: f(x, policy(x, t)), box,
                              x | {"xdot": [f"d {i} / dt" for i in s.state_names]}))
         if value is not None:
@@ -226,9 +227,10 @@ def _slopes(net: FeatureNet, x: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
 def _lean(f: ca.Function, name: str, out: str) -> ca.Function:
     """name:(x, t) -> d f / dx, row by row, by forward derivatives: backwards, CasADi's C copies every weight matrix to
     the stack (77 kB for cart-pole's gain instead of 3)."""
-    x, t = f.mx_in()
-    columns = [ca.jtimes(f(x, t), x, ca.DM.eye(x.numel())[:, i]) for i in range(x.numel())]
-    return ca.Function(name, [x, t], [ca.vec(ca.densify(ca.horzcat(*columns)).T)], ["x", "t"], [out])
+    at = Arguments.of(f)
+    value, x = at.call(f), at["x"]
+    columns = [ca.jtimes(value, x, ca.DM.eye(x.numel())[:, i]) for i in range(x.numel())]
+    return at.function(name, {out: ca.vec(ca.densify(ca.horzcat(*columns)).T)})
 
 
 def _smallest(net: FeatureNet) -> FeatureNet:

@@ -16,6 +16,7 @@ import numpy as np
 from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
 from nocl.support.checks import Array
+from nocl.translate.arguments import Arguments
 
 if TYPE_CHECKING:
     from nocl.solvers.cnd.labels import Labels
@@ -30,26 +31,27 @@ def features(ocp: OCP, x: Array, t: Array, dt: Array | None = None, *, plain: bo
     With dt [n] it is (x, t, dt) -> phi: the clock then stands at the middle of the time that a control is held for.
     `plain` adds the state in units that do not change with time.
     """
-    s, start, held = ocp.system, ca.SX.sym("t"), ca.SX.sym("dt")
-    time = start if dt is None else start + held / 2
+    s, at = ocp.system, ocp.functions.feedback()
+    if dt is not None:
+        at = at.given(dt=ca.SX.sym("dt"))
+    state, time = at["x"], at["t"] if dt is None else at["t"] + at["dt"] / 2
     tau = 2 * time / ocp.horizon - 1
     to_go = ca.fmax(ocp.horizon - time, 0)
     mean, spread = _moments_in_time(x, 2 * (t if dt is None else t + dt / 2) / ocp.horizon - 1)
-    standard = (s.x - _polynomial(mean, tau)) / ca.exp(_polynomial(spread, tau))
+    standard = (state - _polynomial(mean, tau)) / ca.exp(_polynomial(spread, tau))
     once = [i for i in range(s.nx) if i not in ocp.periodic]  # the others have many images: sines and cosines only
-    angles = [g(s.x[i]) for i in s.angle_indices for g in (ca.sin, ca.cos)]
-    off = s.x - ca.DM(ocp.x_goal)
+    angles = [g(state[i]) for i in s.angle_indices for g in (ca.sin, ca.cos)]
+    off = state - ca.DM(ocp.x_goal)
     left = ca.vertcat(*(ca.sin(off[i]) if i in ocp.periodic else off[i] for i in range(s.nx)))
     rush = left / (to_go + LEAST_TIME * ocp.horizon)
     clock = ca.vertcat(tau, ca.log(to_go / ocp.horizon + LEAST_TIME) / 2)
-    more = [s.x[once]] if plain else []
-    raw = ca.vertcat(standard[once], *angles, clock, rush, *more, *([] if dt is None else [held]))
+    more = [state[once]] if plain else []
+    raw = ca.vertcat(standard[once], *angles, clock, rush, *more, *([] if dt is None else [at["dt"]]))
     given = [x, t] if dt is None else [x, t, dt]
-    names, args = ["x", "t", "dt"][:len(given)], [s.x, start, held][:len(given)]
     some = slice(None, None, -(-len(t) // 20_000))  # of every kind of label
-    values = ca.Function("raw", args, [raw])(*(np.atleast_2d(a[some].T) for a in given)).full()
+    values = at.function("raw", {"raw": raw})(*(np.atleast_2d(a[some].T) for a in given)).full()
     centre, width = values.mean(axis=1), values.std(axis=1) + 1e-6
-    return ca.Function("features", args, [(raw - ca.DM(centre)) / ca.DM(width)], names, ["phi"])
+    return at.function("features", {"phi": (raw - ca.DM(centre)) / ca.DM(width)})
 
 
 def _moments_in_time(x: Array, tau: Array) -> tuple[Array, Array]:
@@ -82,15 +84,14 @@ def policy_net(ocp: OCP, labels: Labels, sizes: tuple[int, ...],
     mean, spread = ca.DM(labels.u.mean(axis=0)), ca.DM(labels.u.std(axis=0) + 1e-9)
     y, u = ca.SX.sym("y", s.nu), ca.SX.sym("u", s.nu)
     clipped = ca.fmin(ca.fmax(mean + spread * y, ca.DM(s.lbu)), ca.DM(s.ubu))
-    args = [ca.SX.sym(name, phi.size1_in(i)) for i, name in enumerate(phi.name_in())]
-    outputs = ca.Function("controls", [*args, y], [clipped], [*phi.name_in(), "y"], ["u"])
+    outputs = Arguments.of(phi).function("controls", {"u": clipped}, y=y)
     net = FeatureNet(phi, [MLP([phi.numel_out(0), *sizes, s.nu])], outputs)
     return net, ca.Function("inverse", [u], [(u - mean) / spread], ["u"], ["y"])
 
 
 def at_rate(net: FeatureNet, dt: float) -> FeatureNet:
     """(x, t) -> u of a network (x, t, dt) -> u at one dt; the layers are shared."""
-    x, t, y = (ca.SX.sym(name, net.outputs.size1_in(i)) for name, i in (("x", 0), ("t", 1), ("y", 3)))
-    phi = ca.Function("features", [x, t], [net.inputs(x, t, dt)], ["x", "t"], ["phi"])
-    outputs = ca.Function("controls", [x, t, y], [net.outputs(x, t, dt, y)], ["x", "t", "y"], ["u"])
+    at = Arguments.of(net.outputs).but("dt")
+    phi = at.but("y").function("features", {"phi": at.given(dt=dt).call(net.inputs)})
+    outputs = at.function("controls", {"u": at.given(dt=dt).call(net.outputs)})
     return FeatureNet(phi, [cast(MLP, layers) for layers in net.nets], outputs)

@@ -41,6 +41,7 @@ from nocl.ocp import OCP
 from nocl.solvers.cnd.identity import identity
 from nocl.solvers.cnd.settings import STEPS, PaperSettings
 from nocl.support import store
+from nocl.translate.arguments import Arguments
 from nocl.translate.fused import FusedStep
 from nocl.translate.torch_functions import to_torch
 
@@ -54,15 +55,15 @@ LAST = 20  # iterations that a race is judged by
 
 def controller_net(ocp: OCP, settings: PaperSettings) -> FeatureNet:
     """u(x) or u(x, t) = middle + half width * tanh(MLP): inside U by construction. Weights: torch's seed."""
-    s, x, t = ocp.system, ocp.system.x, ca.SX.sym("t")
-    phi = _features(ocp, t if settings.time_input else None, settings.sin_cos)
+    s, at = ocp.system, ocp.functions.feedback()
+    phi = _features(ocp, at if settings.time_input else at.but("t"), settings.sin_cos)
     y = ca.SX.sym("y", s.nu)
     u = ca.DM((s.lbu + s.ubu) / 2) + ca.DM((s.ubu - s.lbu) / 2) * ca.tanh(y)
     net = MLP((phi.numel(), *settings.hidden, s.nu), settings.activation)
     if settings.near_goal is not None:
         _start_near_goal(ocp, net, settings.near_goal)
-    return FeatureNet(ca.Function("controller_inputs", [x, t], [phi], ["x", "t"], ["phi"]), [net],
-                      ca.Function("controller_output", [x, t, y], [u], ["x", "t", "y"], ["u"]))
+    return FeatureNet(at.function("controller_inputs", {"phi": phi}), [net],
+                      at.function("controller_output", {"u": u}, y=y))
 
 
 def _start_near_goal(ocp: OCP, net: MLP, share: float) -> None:
@@ -77,19 +78,19 @@ def _start_near_goal(ocp: OCP, net: MLP, share: float) -> None:
 
 def value_net(ocp: OCP, settings: PaperSettings) -> FeatureNet:
     """V(x, t), an MLP with a linear skip connection."""
-    x, t, y = ocp.system.x, ca.SX.sym("t"), ca.SX.sym("y")
-    phi = _features(ocp, t, settings.sin_cos)
-    return FeatureNet(ca.Function("value_inputs", [x, t], [phi], ["x", "t"], ["phi"]),
+    at, y = ocp.functions.feedback(), ca.SX.sym("y")
+    phi = _features(ocp, at, settings.sin_cos)
+    return FeatureNet(at.function("value_inputs", {"phi": phi}),
                       [MLP((phi.numel(), *settings.value_hidden, 1), settings.activation, skip=True)],
-                      ca.Function("value_output", [x, t, y], [y], ["x", "t", "y"], ["V"]))
+                      at.function("value_output", {"V": y}, y=y))
 
 
-def _features(ocp: OCP, t: ca.SX | None, sin_cos: bool) -> ca.SX:
-    """The state scaled by its box, sin and cos of its angles, 2 t / T - 1."""
-    s = ocp.system
-    phi = [(s.x - ca.DM((s.lbx + s.ubx) / 2)) / ca.DM((s.ubx - s.lbx) / 2)]
-    phi += [v for i in s.angle_indices if sin_cos for v in (ca.sin(s.x[i]), ca.cos(s.x[i]))]
-    return ca.vertcat(*phi, *([] if t is None else [2 * t / ocp.horizon - 1]))
+def _features(ocp: OCP, at: Arguments, sin_cos: bool) -> ca.SX:
+    """The state scaled by its box, sin and cos of its angles, and 2 t / T - 1 where t is among the arguments."""
+    s, x = ocp.system, at["x"]
+    phi = [(x - ca.DM((s.lbx + s.ubx) / 2)) / ca.DM((s.ubx - s.lbx) / 2)]
+    phi += [v for i in s.angle_indices if sin_cos for v in (ca.sin(x[i]), ca.cos(x[i]))]
+    return ca.vertcat(*phi, *([2 * at["t"] / ocp.horizon - 1] if "t" in at.names else []))
 
 
 def train_paper(ocp: OCP, dynamics: Any = None, settings: PaperSettings | None = None, seed: int = 0, *,
@@ -306,7 +307,7 @@ class _Run:
 def _torch_dynamics(ocp: OCP, dynamics: Any, device: str | torch.device, dtype: torch.dtype) -> hjb.Map:
     """f in torch: exact, or a copy of the learned one whose parameters stay as they are."""
     if dynamics is None:
-        return to_torch(ocp.system.f)
+        return to_torch(ocp.functions.f)
     net = getattr(dynamics, "net", dynamics)
     if isinstance(net, torch.nn.Module):
         return copy.deepcopy(net).to(device, dtype).requires_grad_(False)
@@ -318,7 +319,7 @@ def _torch_dynamics(ocp: OCP, dynamics: Any, device: str | torch.device, dtype: 
 
 def _fused(ocp: OCP) -> hjb.Step:
     try:
-        return FusedStep(ocp.system.f, ocp.L_soft)
+        return FusedStep(ocp.functions.step())
     except ValueError as error:
         raise ValueError(f"{error}; or set fused=False, which is slower") from None
 

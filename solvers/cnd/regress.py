@@ -69,8 +69,8 @@ def policy_loss(ocp: OCP, net: FeatureNet, inverse: ca.Function, labels: Labels)
 def _control_weights(ocp: OCP, low: Tensor, high: Tensor) -> Tensor:
     """The diagonal of L_uu at the goal in the network's units [1, nu], mean 1; equal where it is not positive."""
     s = ocp.system
-    second = ca.Function("second", [s.x, s.u], [ca.diag(ca.hessian(ocp.running, s.u)[0])])
-    H = torch.from_numpy(second(ocp.x_goal, ocp.u_goal).full().T.copy()).float()
+    L_zz = ocp.functions.L_derivatives(ocp.x_goal, ocp.u_goal)[2].full()
+    H = torch.from_numpy(np.diag(L_zz)[None, s.nx:].copy()).float()
     unit = torch.from_numpy(np.asarray(s.ubu) - s.lbu).float() / (high - low)  # u for one unit of y
     weights = H * unit**2 if bool((H > 0).all()) else torch.ones(1, s.nu)
     return weights / weights.mean()

@@ -128,7 +128,7 @@ class _Training:
                  out: str | os.PathLike[str] | None, progress: bool | None) -> None:
         self.ocp, self.settings, self.seed = ocp, settings, seed
         self.learned = dynamics is not None
-        self.f = to_torch(ocp.system.f) if dynamics is None else dynamics
+        self.f = to_torch(ocp.functions.f) if dynamics is None else dynamics
         self.ddp = DDP(ocp, intervals=settings.intervals, dynamics=dynamics)
         self.fine = DDP(ocp, intervals=4 * settings.intervals, dynamics=dynamics)
         self.checkpoint = None if out is None else Path(out) / CHECKPOINT

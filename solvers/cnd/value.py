@@ -27,6 +27,7 @@ from nocl.solvers.ddp.bank import SolutionBank
 from nocl.solvers.ddp.solver import DDP, DDPSolution
 from nocl.support.checks import Array
 from nocl.support.compiler import NoCompilerError
+from nocl.translate.arguments import Arguments
 from nocl.translate.torch_functions import to_torch
 
 SMALL = 0.02  # of the median: labels below count as if they were that large in relative errors
@@ -85,11 +86,11 @@ def on_fine_grid(fine: DDP, coarse: DDPSolution) -> Iterator[DDPSolution]:
 
 def value_net(ocp: OCP, labels: ValueLabels, sizes: tuple[int, ...]) -> FeatureNet:
     """(x, t) -> V = floor + unit |y|^2; the floor is 0 where all labels are positive, else below them."""
-    s, time = ocp.system, ca.SX.sym("t")
+    s, at = ocp.system, ocp.functions.feedback()
     phi = features(ocp, labels.x, labels.t, plain=True)
     y, floor = ca.SX.sym("y", s.nx + 1), _floor(labels)
     unit = float(np.median(labels.V - floor))
-    V = ca.Function("value", [s.x, time, y], [floor + unit * ca.sumsqr(y)], ["x", "t", "y"], ["V"])
+    V = at.function("value", {"V": floor + unit * ca.sumsqr(y)}, y=y)
     return FeatureNet(phi, [MLP([phi.numel_out(0), *sizes, s.nx + 1], skip=True)], V)
 
 
@@ -140,11 +141,11 @@ def _units(net: FeatureNet) -> tuple[float, float]:
 
 def _features_and_slopes(net: FeatureNet, labels: ValueLabels, scale: Array) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """phi [n, F] of all labels, and d phi / d (x / scale) as nonzeros [n, nz] with their rows, columns."""
-    x, t = (ca.SX.sym(n, net.inputs.size1_in(i)) for i, n in enumerate("xt"))
-    phi = net.inputs(x, t)
-    J = ca.jacobian(phi, x)
+    at = Arguments.of(net.inputs)
+    phi = at.call(net.inputs)
+    J = ca.jacobian(phi, at["x"])
     rows, columns = (torch.tensor(i) for i in J.sparsity().get_triplet())
-    both = to_torch(ca.Function("both", [x, t], [ca.densify(phi), J.nz[:]]))
+    both = to_torch(at.function("both", {"phi": ca.densify(phi), "slopes": J.nz[:]}))
     X, T = torch.from_numpy(labels.x), torch.from_numpy(labels.t)[:, None]
     with torch.no_grad():
         parts = [both(X[i:i + CHUNK], T[i:i + CHUNK]) for i in range(0, len(X), CHUNK)]

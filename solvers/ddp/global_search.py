@@ -31,7 +31,7 @@ from nocl.sampling import Seed
 from nocl.solvers.ddp.bank import SolutionBank, spread
 from nocl.solvers.ddp.batch import bytes_each
 from nocl.solvers.ddp.solver import DDP, DDPSolution
-from nocl.solvers.nmpc.guesses import jacobian_of, mirrored, mirrors
+from nocl.solvers.nmpc.guesses import mirrored, mirrors
 from nocl.solvers.nmpc.search import SAME, TINY, distinct
 from nocl.support import checks
 from nocl.support.checks import Array
@@ -346,13 +346,12 @@ def equilibria(ocp: OCP, draws: int, rng: np.random.Generator, dynamics: Any = N
     if s.xdot is None and dynamics is None:  # a plant that is not known: no other equilibria are
         return goal
     low, high = np.r_[s.lbx, s.lbu], np.r_[s.ubx, s.ubu]
-    f = dynamics_function(ocp, dynamics)
-    slope = jacobian_of(f)
+    of = ocp.functions.on(dynamics_function(ocp, dynamics))
 
     def linear(z: Array) -> tuple[Array, Array]:
         x, u = np.split(z.T, [s.nx])
-        J = slope.map(len(z))(x, u).full().reshape(s.nx, len(z), -1).transpose(1, 0, 2)
-        return f.map(len(z))(x, u).full().T, J
+        AB = (j.full().reshape(s.nx, len(z), -1) for j in of.jacobian.map(len(z))(x, u))
+        return of.f.map(len(z))(x, u).full().T, np.concatenate(list(AB), axis=2).transpose(1, 0, 2)
 
     z = rng.uniform(low, high, (draws, len(low)))
     for _ in range(NEWTON):

@@ -10,6 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from nocl.functions import Stage
 from nocl.ocp import OCP
 from nocl.support.checks import Array
 from nocl.translate.kernels import emit
@@ -36,21 +37,20 @@ def pack_weights(net: Any) -> Array:
 
 def ddp_source(ocp: OCP, net: Any = None) -> str:
     """The generated part of the kernel: what csrc/ddp.h lists, for the exact f or for f_theta's FeatureNet."""
-    x, u = ocp.system.x, ocp.system.u
-    stage = _Stage(ocp, net)
-    nets, networks = stage.nets, stage.networks
-    sizes = {"N": x.numel(), "M": u.numel(), "NET": networks.numel(), "TAPE": sum(n.tape for n in nets),
+    at = ocp.functions.stage
+    stage = _Derivatives(at, net)
+    nets, networks, n, m = stage.nets, stage.networks, ocp.system.nx, ocp.system.nu
+    sizes = {"N": n, "M": m, "NET": networks.numel(), "TAPE": sum(n.tape for n in nets),
              "NV": stage.v.numel(), "BEND": stage.bend.numel(), "NJ": stage.J.nnz(), "NW": stage.W.nnz()}
     lines = ['#include "lanes.h"', *(['#include "mlp.h"'] if nets else []),
-             *(f"#define {name} {value}" for name, value in sizes.items()), _STEP, _networks(x, u, nets),
-             emit("field", [x, u, networks], [ca.densify(stage.rhs)]),
-             emit("stage_jacobian", [x, u, networks], [stage.J.T]),
-             emit("network_weights", [x, u, networks, stage.mu], [stage.v]),
-             emit("stage_hessian", [x, u, networks, stage.bend, stage.mu], [stage.W]),
-             _chain(x.numel(), u.numel(), stage.J.sparsity(), stage.W.sparsity())]
-    G = ocp.terminal
-    H, g = ca.hessian(G, x)
-    lines.append(emit("terminal", [x], [ca.densify(G), ca.densify(g), ca.densify(H)]))
+             *(f"#define {name} {value}" for name, value in sizes.items()), _STEP, _networks(at, nets),
+             emit("field", [*at.inputs, networks], [ca.densify(stage.rhs)]),
+             emit("stage_jacobian", [*at.inputs, networks], [stage.J.T]),
+             emit("network_weights", [*at.inputs, networks, stage.mu], [stage.v]),
+             emit("stage_hessian", [*at.inputs, networks, stage.bend, stage.mu], [stage.W]),
+             _chain(n, m, stage.J.sparsity(), stage.W.sparsity())]
+    end = ocp.functions.end
+    lines.append(emit("terminal", end.inputs, end.call(ocp.functions.G_derivatives)))
     lines.append('#include "ddp.h"\n')
     return "\n".join(lines)
 
@@ -89,19 +89,18 @@ def _symmetric(q: int, upper: Columns) -> ca.SX:
     return H
 
 
-class _Stage:
+class _Derivatives:
     """(xdot, L) at a stage, its Jacobian and the weighted Hessian's lower triangle, with the networks as symbols."""
 
-    def __init__(self, ocp: OCP, net: Any) -> None:
-        x, u = ocp.system.x, ocp.system.u
-        z, self.mu = ca.vertcat(x, u), ca.SX.sym("mu", x.numel() + 1)
-        phi = net.inputs.call([x, u]) if net is not None and net.nets else []
+    def __init__(self, at: Stage, net: Any) -> None:
+        z, self.mu = at.z, ca.SX.sym("mu", at.x.numel() + 1)
+        phi = net.inputs.call(at.inputs) if net is not None and net.nets else []
         nets = zip(net.nets, phi, strict=True) if phi else ()
         self.nets = [_Net(mlp, p, z, i) for i, (mlp, p) in enumerate(nets)]
         self.networks = ca.vertcat(*(ca.vec(n.symbols) for n in self.nets))
         self.bend = ca.vertcat(*(n.bend for n in self.nets))
-        xdot: Any = ocp.system.equations if net is None else net.outputs(x, u, *(n.y for n in self.nets))
-        self.rhs = ca.vertcat(xdot, ocp.L_soft(x, u))
+        xdot = at.xdot if net is None else net.outputs(*at.inputs, *(n.y for n in self.nets))
+        self.rhs = ca.vertcat(xdot, at.L_soft)
         y, yz = ca.vertcat(*(n.y for n in self.nets)), ca.vertcat(*(n.slopes for n in self.nets))
         self.J, scalar = ca.jacobian(self.rhs, z), ca.dot(self.mu, self.rhs)
         H, self.v = ca.hessian(scalar, z)[0], ca.SX(0, 1)
@@ -180,28 +179,29 @@ def _straight_chain(n: int, m: int, J_pattern: ca.Sparsity, W_pattern: ca.Sparsi
             emit("step_derivatives", [Js, Ws, h], [ca.densify(F.T), ca.densify(cost), ca.densify(H)])]
 
 
-def _networks(x: ca.SX, u: ca.SX, nets: Sequence[_Net]) -> str:
+def _networks(at: Stage, nets: Sequence[_Net]) -> str:
     """C of network_values(), network_slopes() and network_bend(): features by generated code, then each MLP."""
+    given, parameters = ", ".join(at.names), "".join(f"const lane *{name}, " for name in at.names)
     values, slopes, bend = _Body(), _Body(), _Body()
     emitted, weight, net, tape, v, bent = [], 1, 0, 0, 0, 0
     for g, n in enumerate(nets):
         d, C, sizes = n.phi.numel(), n.q + 1, n.mlp.sizes
-        emitted += [emit(f"features{g}", [x, u], [n.phi]),
-                    emit(f"seeds{g}", [x, u], [ca.vec(ca.horzcat(n.phi, n.seeds).T)])]
+        emitted += [emit(f"features{g}", at.inputs, [n.phi]),
+                    emit(f"seeds{g}", at.inputs, [ca.vec(ca.horzcat(n.phi, n.seeds).T)])]
         widest, skip = max(sizes), int(n.mlp.skip is not None)
         shape = f"{{{', '.join(map(str, sizes))}}}"
         common = f"weights + {weight}, (const int[]){shape}, {len(sizes) - 1}"
         kind = ACTIVATION_KINDS[n.mlp.activation]
-        values.add(f"lane phi[{d}], a[{widest}], b[{widest}]; features{g}(x, u, phi);",
+        values.add(f"lane phi[{d}], a[{widest}], b[{widest}]; features{g}({given}, phi);",
                    f"mlp_values({common}, {kind}, {skip}, {C}, phi, a, b, net + {net});")
-        slopes.add(f"lane phi[{d * C}], a[{widest * C}], b[{widest * C}]; seeds{g}(x, u, phi);",
+        slopes.add(f"lane phi[{d * C}], a[{widest * C}], b[{widest * C}]; seeds{g}({given}, phi);",
                    f"mlp_slopes({common}, {kind}, {skip}, {C}, phi, tape + {tape}, a, b, net + {net});")
         bend.add(f"lane a[{widest}], b[{widest}], work[{widest}], *H = bend + {bent};",
                  f"mlp_bend({common}, {skip}, {n.q}, v + {v}, tape + {tape}, a, b, work, H, H + {n.bend.numel() - d});")
         weight, net, tape = weight + n.weights, net + n.symbols.numel(), tape + n.tape
         v, bent = v + sizes[-1], bent + n.bend.numel()
-    return "\n".join([*emitted, values.function("network_values", "const lane *x, const lane *u, lane *net"),
-                      slopes.function("network_slopes", "const lane *x, const lane *u, lane *net, lane *tape"),
+    return "\n".join([*emitted, values.function("network_values", f"{parameters}lane *net"),
+                      slopes.function("network_slopes", f"{parameters}lane *net, lane *tape"),
                       bend.function("network_bend", "const lane *v, const lane *tape, lane *bend")])
 
 

@@ -19,7 +19,6 @@ from nocl.solvers.ddp.kernel import ddp_source
 from nocl.support.checks import Array
 from nocl.support.compiler import NoCompilerError
 from nocl.translate.kernels import Kernel
-from nocl.translate.rk4 import rk4_cost
 
 Rows = NDArray[np.int64]
 Mask = NDArray[np.bool_]
@@ -45,18 +44,14 @@ class NumpyKernel:
     width = 1
 
     def __init__(self, ocp: OCP, dynamics: Any = None) -> None:
-        x, u, lam = (ca.MX.sym(name, n) for name, n in (("x", ocp.system.nx), ("u", ocp.system.nu),
-                                                        ("lam", ocp.system.nx)))
-        h, z, self.shape = ca.MX.sym("h"), ca.vertcat(x, u), (ocp.system.nx, ocp.system.nu)
-        after, cost = rk4_cost(ocp.system.f if dynamics is None else dynamics.to_casadi(), ocp.L_soft, x, u, h)
-        G = ocp.G(x)
-        H, g = ca.hessian(ca.dot(lam, after) + cost, z)[0], ca.gradient(cost, z)
-        step = ca.Function("step", [x, u, h], [after, cost])
-        slopes = ca.Function("slopes", [x, u, h, lam], [cost, ca.jacobian(after, z), g, H])
-        terminal = ca.Function("terminal", [x], [G, ca.gradient(G, x), ca.hessian(G, x)[0]])
-        if dynamics is None:  # SX runs faster
-            step, slopes = step.expand(), slopes.expand()
-        self._step, self._slopes, self._terminal = step, slopes, terminal
+        of = ocp.functions if dynamics is None else ocp.functions.on(dynamics.to_casadi())
+        at, self.shape = of.stage, (ocp.system.nx, ocp.system.nu)
+        h, lam = at.sym("h"), at.sym("lam", ocp.system.nx)
+        after, cost = at.interval(h)
+        H, g = ca.hessian(ca.dot(lam, after) + cost, at.z)[0], ca.gradient(cost, at.z)
+        self._step, self._terminal = of.step(), of.G_derivatives
+        self._slopes = at.function("slopes", {"cost": cost, "F_z": ca.jacobian(after, at.z), "cost_z": g, "Q_zz": H},
+                                   h=h, lam=lam)
 
     def __call__(self, name: str, problems: Rows, *args: Any, threads: int = 1) -> None:
         """Run "nocl_rollout" or "nocl_backward" on the given problem numbers; threads play no part."""

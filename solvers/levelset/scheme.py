@@ -73,7 +73,7 @@ class Dynamics(hj.dynamics.Dynamics):
 
     def __init__(self, ocp: OCP, minimise: Minimiser, axes: tuple[Axis, ...], samples: int) -> None:
         self.minimise, self.axes = minimise, axes
-        self.f, self.L = to_jax(ocp.system.f), to_jax(ocp.L_soft)
+        self.f, self.L = to_jax(ocp.functions.f), to_jax(ocp.L_soft)
         self.controls, self.safety = _extremes(ocp, samples)
         low, high = self._ends(jnp.asarray(_some(axes)))
         both = (low < -STILL) & (high > STILL)
@@ -197,17 +197,17 @@ def eased(ocp: OCP, slope: float) -> OCP:
     if ocp.penalty == 0:
         return ocp
     added = ca.SX(0)
-    for h in ocp.path_constraints.values():
+    for h in ca.vertsplit(ocp.functions.constraints):
         depth = ca.fmax(ocp.penalty_margin - h, 0)
         bent = ca.fmin(depth, slope / (2 * ocp.penalty))
         added += ocp.penalty * bent**2 + slope * (depth - bent)
-    return replace(ocp, running=ocp.running + added, path_constraints={})
+    return replace(ocp, running=ocp.functions.running + added, path_constraints={})
 
 
 def _extremes(ocp: OCP, samples: int) -> tuple[Array, float]:
     """Controls among which |f_i| is largest, and a safety factor: U's corners, exact where f is affine in each u_i."""
-    s = ocp.system
-    bent = [ca.jacobian(ca.jacobian(s.equations, s.u[i]), s.u[i]).nnz() for i in range(s.nu)]
+    s, at = ocp.system, ocp.functions.stage
+    bent = [ca.jacobian(ca.jacobian(at.xdot, at.u[i]), at.u[i]).nnz() for i in range(s.nu)]
     n, safety = (samples, SAFETY) if any(bent) else (2, 1.0)
     ends = [np.linspace(low, high, n) for low, high in zip(s.lbu, s.ubu, strict=True)]
     return np.array(list(itertools.product(*ends))), safety

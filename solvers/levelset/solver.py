@@ -23,7 +23,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import NdBSpline, make_interp_spline
@@ -347,12 +346,16 @@ def periodic_axes(ocp: OCP, lower: Array, upper: Array) -> Array:
     s = ocp.system
     rng = np.random.default_rng(0)
     x, u = rng.uniform(lower, upper, (64, s.nx)), rng.uniform(s.lbu, s.ubu, (64, s.nu))
-    at = ca.Function("at", [s.x, s.u], [ca.vertcat(s.equations, ocp.L_soft(s.x, s.u), ocp.terminal)])
-    here, scale = at(x.T, u.T).full(), 1e-9 * (1 + np.abs(at(x.T, u.T).full()))
+    of = ocp.functions
+
+    def values(x: Array) -> Array:
+        return np.vstack([of.f(x.T, u.T).full(), of.L_soft(x.T, u.T).full(), of.G(x.T).full()])
+
+    here, scale = values(x), 1e-9 * (1 + np.abs(values(x)))
     found = np.zeros(s.nx, dtype=bool)
     for i in s.angle_indices:
         turned = x + PERIOD * np.eye(s.nx)[i]
-        same = bool((np.abs(at(turned.T, u.T).full() - here) <= scale).all())
+        same = bool((np.abs(values(turned) - here) <= scale).all())
         found[i] = same and bool(upper[i] - lower[i] >= PERIOD * (1 - 1e-9))
     return found
 

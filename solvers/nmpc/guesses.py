@@ -123,14 +123,12 @@ def sides(ocp: OCP, x0: Array, N: int) -> list[Array]:
     """Lines from x0 to the goal [N+1, nx], bent round each obstacle that the straight one crosses, on either side."""
     s, found = np.linspace(0.0, 1.0, N + 1)[:, None], list[Array]()
     line = x0 + s * (ocp.x_goal - x0)
-    h = ca.vertcat(*ocp.path_constraints.values())
-    gradients = ca.Function("h_x", [ocp.system.x], [ca.jacobian(h, ocp.system.x)])
     for i in range(len(ocp.path_constraints)):
         values = ocp.h(line.T).full()[i]
         k = int(np.argmin(values))
         if values[k] >= 0:
             continue
-        across = _across(gradients(line[k]), i, ocp.x_goal - x0)
+        across = _across(ocp.functions.h_derivatives(line[k], 0)[1], i, ocp.x_goal - x0)
         if across is None:
             continue
         for side in (across, -across):
@@ -186,20 +184,14 @@ def mirrors(ocp: OCP, dynamics: Any = None) -> list[tuple[Array, Array]]:
 def _coupled(ocp: OCP, f: ca.Function, rounding: float) -> NDArray[np.int32]:
     """A number for each of (x, u), equal where f's Jacobian or a Hessian of L or G at the goal couples them."""
     s = ocp.system
-    n, z = s.nx, ca.vertcat(s.x, s.u)
-    H = ca.hessian(ocp.running, z)[0] + ca.diagcat(ca.hessian(ocp.terminal, s.x)[0], ca.SX(s.nu, s.nu))
-    H = ca.Function("hessians", [s.x, s.u], [H])(ocp.x_goal, ocp.u_goal).full()
-    A = jacobian_of(f)(ocp.x_goal, ocp.u_goal).full()
+    n, of = s.nx, ocp.functions.on(f)
+    H = of.L_derivatives(ocp.x_goal, ocp.u_goal)[2].full()
+    H[:n, :n] += of.G_derivatives(ocp.x_goal)[2].full()
+    A = np.hstack([j.full() for j in of.jacobian(ocp.x_goal, ocp.u_goal)])
     scale = np.r_[s.ubx - s.lbx, s.ubu - s.lbu]
     A, H = np.abs(A * scale) / scale[:n, None], np.abs(H * np.outer(scale, scale))
     H[:n] += A
     return np.asarray(connected_components(rounding * H.max() < H, directed=False)[1])
-
-
-def jacobian_of(f: ca.Function) -> ca.Function:
-    """(x, u) -> df/d(x, u) [nx, nx + nu] of an f:(x, u) -> xdot, symbolic or learned."""
-    x, u = f.mx_in()
-    return ca.Function("jacobian", [x, u], [ca.densify(ca.horzcat(*(ca.jacobian(f(x, u), v) for v in (x, u))))])
 
 
 def mirrored(ocp: OCP, mirror: tuple[Array, Array], x: Array, u: Array) -> Guess:

@@ -32,11 +32,10 @@ class Derivatives:
     @cached_property
     def flow(self) -> ca.Function:
         """(x, u, costate) -> d/dt of (x, costate), the control held: f and -dH/dx."""
-        p, s = self.program, self.program.ocp.system
-        x, u, costate = p.sym("x", s.nx), p.sym("u", s.nu), p.sym("costate", s.nx)
-        xdot = p.f(x, u)
-        return ca.Function("flow", [x, u, costate], [
-            ca.vertcat(xdot, -ca.gradient(p.L(x, u) + ca.dot(costate, xdot), x))])
+        p, at = self.program, self.program.functions.stage
+        costate = at.sym("costate", p.ocp.system.nx)
+        H_x = ca.gradient(at.hamiltonian(costate, soft=p.soft), at.x)
+        return at.function("flow", {"slope": ca.vertcat(at.xdot, -H_x)}, costate=costate)
 
     @cached_property
     def first(self) -> ca.Function:
@@ -49,31 +48,19 @@ class Derivatives:
         return self._stage(second=True)
 
     def _stage(self, second: bool) -> ca.Function:
-        p, s = self.program, self.program.ocp.system
-        x, u, h, costate = p.sym("x", s.nx), p.sym("u", s.nu), p.sym("h"), p.sym("costate", s.nx)
-        z = p.sym("z", s.nx + s.nu)
-        end, cost = p.step(z[: s.nx], z[s.nx:], h)
-        hessian, gradient = ca.hessian(cost + ca.dot(costate, end), z)
-        out = [gradient, ca.jacobian(end, z), hessian] if second else [gradient]
-        inner = ca.Function("Q", [z, h, costate], [ca.densify(e) for e in out])
-        return ca.Function("stage", [x, u, h, costate], inner.call([ca.vertcat(x, u), h, costate]))
+        p, at = self.program, self.program.functions.stage
+        h, costate = at.sym("h"), at.sym("costate", p.ocp.system.nx)
+        end, cost = at.given(h=h).call(p.step)
+        Q_zz, Q_z = ca.hessian(cost + ca.dot(costate, end), at.z)
+        out = {"Q_z": Q_z, "F_z": ca.jacobian(end, at.z), "Q_zz": Q_zz} if second else {"Q_z": Q_z}
+        return at.function("stage", {name: ca.densify(e) for name, e in out.items()}, h=h, costate=costate)
 
     @cached_property
     def end(self) -> ca.Function:
         """(x, t) -> (gradient, Hessian) of the cost at the last node."""
-        n = self.program.ocp.system.nx
-        x, t = ca.MX.sym("x", n), ca.MX.sym("t")
-        hessian, gradient = ca.hessian(self.program.end_cost(x, t), x)
-        return ca.Function("end", [x, t], [ca.densify(gradient), ca.densify(hessian)])
-
-    @cached_property
-    def path(self) -> ca.Function:
-        """(x, mu) -> (h, dh/dx, Hessian of mu' h)."""
-        ocp = self.program.ocp
-        x, mu = ca.SX.sym("x", ocp.system.nx), ca.SX.sym("mu", self.program.n_path)
-        h = ocp.h(x)
-        return ca.Function("path", [x, mu], [h, ca.densify(ca.jacobian(h, x)),
-                                             ca.densify(ca.hessian(ca.dot(mu, h), x)[0])])
+        at = self.program.functions.feedback(ca.MX)
+        hessian, gradient = ca.hessian(self.program.end_cost(*at.inputs), at["x"])
+        return at.function("end", {"V_x": ca.densify(gradient), "V_xx": ca.densify(hessian)})
 
 
 @lru_cache(maxsize=32)
@@ -124,12 +111,12 @@ def _with_path(program: Transcription, x: Array, jump: Array, P: Array, H: Array
     """P and the equations H dx = 0 with a node's own path constraints; the costate jumps by mu' dh/dx across it."""
     if not program.n_path:
         return P, H
-    d = derivatives(program)
-    h, h_x = (v.full() for v in d.path(x, 0)[:2])
+    path = program.functions.h_derivatives
+    h, h_x = (v.full() for v in path(x, 0)[:2])
     mu = np.linalg.lstsq(h_x.T, jump, rcond=None)[0]
     active = mu > np.maximum(h[:, 0], 0.0) + np.sqrt(ROUNDING)
     mu = np.where(active, mu, 0.0)
-    return P - d.path(x, mu)[2].full(), np.vstack([H, h_x[active]])
+    return P - path(x, mu)[2].full(), np.vstack([H, h_x[active]])
 
 
 def _riccati(F_z: Array, W: Array, P: Array, H: Array, free: NDArray[np.bool_]) -> tuple[Array, Array, Array] | None:

@@ -17,10 +17,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from nocl.functions import Functions
 from nocl.ocp import OCP
 from nocl.support import compiler, interrupt
 from nocl.support.checks import Array
-from nocl.translate.rk4 import rk4_cost, rk4_interval
 
 BACKENDS: dict[str, dict[str, Any]] = {
     "ipopt": {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-9, "ipopt.max_iter": 500},
@@ -64,21 +64,16 @@ class Transcription:
     terminal: ca.Function | None = None  # (x) or (x, t) -> cost at the last node; default: G
     compiled: tuple[str, Path] | None = None  # (the program's key, cache folder) of compiled functions; or interpreted
 
-    @property
-    def L(self) -> ca.Function:
-        """(x, u) -> running cost, with the penalty where `soft`."""
-        return self.ocp.L_soft if self.soft else self.ocp.L
+    @cached_property
+    def functions(self) -> Functions:
+        """Those of the problem under f."""
+        return self.ocp.functions.on(self.f)
 
     def end_cost(self, x: Any, t: Any) -> Any:
         """What the state x at the last node, at time t, costs."""
         if self.terminal is None:
             return self.ocp.G(x)
         return self.terminal(*(x, t)[: self.terminal.n_in()])
-
-    @property
-    def sym(self) -> Any:
-        """SX.sym, or MX.sym where the dynamics are MX."""
-        return ca.SX.sym if self.f.is_a("SXFunction") else ca.MX.sym
 
     @property
     def expandable(self) -> bool:
@@ -92,17 +87,12 @@ class Transcription:
     @cached_property
     def step(self) -> ca.Function:
         """(x, u, h) -> (x at the end of the interval, integral of L over it)."""
-        s = self.ocp.system
-        x, u, h = self.sym("x", s.nx), self.sym("u", s.nu), self.sym("h")
-        end, cost = rk4_cost(self.f, self.L, x, u, h, self.substeps)
-        return ca.Function("step", [x, u, h], [end, cost], ["x", "u", "h"], ["end", "cost"])
+        return self.functions.step(soft=self.soft, substeps=self.substeps)
 
     @cached_property
     def rollout(self) -> ca.Function:
         """(x0, u [nu, N], h [1, N]) -> x_1 ... x_N [nx, N]."""
-        s = self.ocp.system
-        x, u, h = self.sym("x", s.nx), self.sym("u", s.nu), self.sym("h")
-        return ca.Function("F", [x, u, h], [rk4_interval(self.f, x, u, h, self.substeps)]).mapaccum(self.N)
+        return self.step.slice("F", range(self.step.n_in()), [0]).mapaccum(self.N)
 
     @cached_property
     def program(self) -> dict[str, ca.MX]:
