@@ -1,4 +1,4 @@
-"""Every ONNX operation that is read equals ONNX Runtime: opset by opset, type by type, on random and special numbers."""
+"""Every ONNX operation that is read equals ONNX Runtime: each opset and type, random and special numbers."""
 
 from __future__ import annotations
 
@@ -169,8 +169,8 @@ def gemm(kind: str, version: int, rng: Any) -> list[Any]:
 
 
 def matmul(kind: str, version: int, rng: Any) -> list[Any]:
-    shapes = [((1, 4), (4, 3)), ((4,), (4, 3)), ((3, 4), (4,)), ((4,), (4,)), ((1, 3, 4), (4, 2)), ((1, 2, 3, 4), (2, 4, 3)),
-              ((3, 4), (1, 4, 1)), ((1, 2, 3), (1, 3, 2))]
+    shapes = [((1, 4), (4, 3)), ((4,), (4, 3)), ((3, 4), (4,)), ((4,), (4,)), ((1, 3, 4), (4, 2)),
+              ((1, 2, 3, 4), (2, 4, 3)), ((3, 4), (1, 4, 1)), ((1, 2, 3), (1, 3, 2))]
     both = [[rng.normal(size=s).astype(np.float32) for s in pair] for pair in shapes]
     return [([a, b], {}) for a, b in both] + [([a, b.view(Weight)], {}) for a, b in both]
 
@@ -208,7 +208,8 @@ def sliced(kind: str, version: int, rng: Any) -> list[Any]:
     x, far = block(kind, rng), 2**63 - 1
     plain = [([1], [3], [2]), ([0, 1], [2, far], [1, 2]), ([-2], [-1], [2]), ([-100], [far], [1]), ([2], [-far], [2])]
     if version < 10:
-        return [([x], {"starts": s, "ends": e, "axes": a}) for s, e, a in plain[:4]] + [([x], {"starts": [0], "ends": [1]})]
+        short = [([x], {"starts": [0], "ends": [1]})]
+        return short + [([x], {"starts": s, "ends": e, "axes": a}) for s, e, a in plain[:4]]
     steps = [([3], [0], [2], [-1]), ([-1], [-far], [2], [-2]), ([0], [far], [2], [3]), ([-100], [-100], [2], [-1]),
              ([far, 0], [-far, 2], [-1, 1], [-1, 1]), ([2], [-4], [2], [-1])]
     return [([x, *(fixed(v) for v in case)], {}) for case in plain[:4] + steps] + [([x, fixed([0]), fixed([1])], {})]
@@ -218,7 +219,8 @@ def split(kind: str, version: int, rng: Any) -> list[Any]:
     x = block(kind, rng)
     sizes, whole = [[1, 3], [2, 2], [4]], [([x], {"axis": 1, "outputs": 3}), ([x], {"axis": -1, "outputs": 2})]
     if version >= 18:
-        whole = [([x], {"axis": a, "num_outputs": n, "outputs": n}) for a, n in ((2, 3), (2, 2), (-1, 4), (1, 3), (-2, 2))]
+        parts = ((2, 3), (2, 2), (-1, 4), (1, 3), (-2, 2))
+        whole = [([x], {"axis": a, "num_outputs": n, "outputs": n}) for a, n in parts]
     if version < 13:
         return whole + [([x], {"axis": 2, "split": s, "outputs": len(s)}) for s in sizes]
     return whole + [([x, fixed(s)], {"axis": -1, "outputs": len(s)}) for s in sizes]
@@ -252,11 +254,13 @@ def gather_elements(kind: str, version: int, rng: Any) -> list[Any]:
 
 def concat(kind: str, version: int, rng: Any) -> list[Any]:
     x, y = block(kind, rng), block(kind, rng)
-    return [([x, y], {"axis": 1}), ([x, y[..., :2], x], {"axis": -1}), ([x, y.view(Weight)], {"axis": 2}), ([x], {"axis": 0})]
+    return [([x, y], {"axis": 1}), ([x, y[..., :2], x], {"axis": -1}), ([x, y.view(Weight)], {"axis": 2}),
+            ([x], {"axis": 0})]
 
 
 def flatten(kind: str, version: int, rng: Any) -> list[Any]:
-    return [([block(kind, rng)], {} if a is None else {"axis": a}) for a in (None, 0, 1, 2, 3, *((-1, -2) * (version >= 11)))]
+    axes = [0, 1, 2, 3, *([-1, -2] if version >= 11 else [])]
+    return [([block(kind, rng)], options) for options in ({}, *({"axis": a} for a in axes))]
 
 
 def transpose(kind: str, version: int, rng: Any) -> list[Any]:
@@ -288,20 +292,21 @@ def count(kind: str, version: int, rng: Any) -> list[Any]:
 ALPHA = ({}, {"alpha": 0.3}, {"alpha": 1.7})
 CASES: dict[str, Cases] = {
     **{op: unary() for op in RULES},  # but for
-    **dict.fromkeys(("Add", "Sub", "Mul", "Less", "LessOrEqual", "Greater", "GreaterOrEqual", "Equal", "And", "Or", "Xor"),
-                    binary),
-    **dict.fromkeys(("Sum", "Mean", "Max", "Min"), several), **dict.fromkeys(("Elu", "LeakyRelu", "ThresholdedRelu",
-                                                                            "Celu", "Swish"), unary(*ALPHA)),
+    **dict.fromkeys(("Add", "Sub", "Mul", "Less", "LessOrEqual", "Greater", "GreaterOrEqual"), binary),
+    **dict.fromkeys(("Equal", "And", "Or", "Xor"), binary), **dict.fromkeys(("Sum", "Mean", "Max", "Min"), several),
+    **dict.fromkeys(("Elu", "LeakyRelu", "ThresholdedRelu", "Celu", "Swish"), unary(*ALPHA)),
     "Div": divide, "Mod": mod, "Pow": power, "Clip": clip, "Where": where, "Cast": casts, "CastLike": casts_like,
-    "PRelu": prelu, "Selu": unary({}, {"alpha": 1.2, "gamma": 0.7}), "HardSigmoid": unary({}, {"alpha": 0.5, "beta": 0.1}),
-    "Gelu": unary({}, {"approximate": "tanh"}, {"approximate": "none"}), "Shrink": unary({}, {"lambd": 1.5, "bias": 0.25}),
+    "PRelu": prelu, "Selu": unary({}, {"alpha": 1.2, "gamma": 0.7}),
+    "HardSigmoid": unary({}, {"alpha": 0.5, "beta": 0.1}), "Shrink": unary({}, {"lambd": 1.5, "bias": 0.25}),
+    "Gelu": unary({}, {"approximate": "tanh"}, {"approximate": "none"}),
     "IsInf": unary({}, {"detect_positive": 0}, {"detect_negative": 0}), "MatMul": matmul, "Gemm": gemm,
     **{op: reduction(18) for op in RULES if op.startswith("Reduce")}, "ReduceSum": reduction(13),
     **dict.fromkeys(("ArgMax", "ArgMin"), extreme_index), **dict.fromkeys(("Softmax", "LogSoftmax"), softmax),
-    "LayerNormalization": layer_norm, "RMSNormalization": rms_norm, "BatchNormalization": batch_norm, "Dropout": dropout,
-    "Constant": constant, "ConstantOfShape": constant_of_shape, "Range": count, "Shape": shape, "Concat": concat,
-    "Transpose": transpose, "Reshape": reshape, "Flatten": flatten, "Slice": sliced, "Split": split, "Gather": gather,
-    "GatherElements": gather_elements, "Expand": sized([1, 3, 4], [2, 1, 1, 4], [1], [3, 1]), "Tile": sized([1, 2, 3], [1] * 3),
+    "LayerNormalization": layer_norm, "RMSNormalization": rms_norm, "BatchNormalization": batch_norm,
+    "Dropout": dropout, "Constant": constant, "ConstantOfShape": constant_of_shape, "Range": count, "Shape": shape,
+    "Concat": concat, "Transpose": transpose, "Reshape": reshape, "Flatten": flatten, "Slice": sliced, "Split": split,
+    "Gather": gather, "GatherElements": gather_elements, "Expand": sized([1, 3, 4], [2, 1, 1, 4], [1], [3, 1]),
+    "Tile": sized([1, 2, 3], [1] * 3),
     "Squeeze": with_axes((1, 3, 1, 4), None, [0], [2], [-2], [0, 2]),
     "Unsqueeze": with_axes((3, 4), [0], [-1], [1, 3], [0, -1])}
 NO_INPUT_KIND = {"Constant", "ConstantOfShape", "Range"}
@@ -313,7 +318,8 @@ HISTORY = [(s.name, s.since_version) for s in onnx.defs.get_all_schemas_with_his
 def versions(op: str) -> list[int]:
     """The opsets that gave this operation its meanings, of those that are read."""
     began = sorted(version for name, version in HISTORY if name == op)
-    return [max(v, OLDEST) for i, v in enumerate(began) if v <= NEWEST and (i + 1 == len(began) or began[i + 1] > OLDEST)]
+    ended = [*began[1:], NEWEST + 1]
+    return [max(v, OLDEST) for v, end in zip(began, ended, strict=True) if v <= NEWEST and end > OLDEST]
 
 
 def kinds(op: str, version: int) -> str:

@@ -75,7 +75,7 @@ def _mod(call: Call) -> Tensor:
 
 def _power(call: Call) -> Tensor:
     if call.args[0].dtype.kind == "i":
-        return elementwise(lambda a, b: truncated(ca.power(a, b)), *call.args)
+        return elementwise(lambda a, b: truncated(ca.MX(ca.power(a, b))), *call.args)
     return elementwise(ca.power, *call.args)
 
 
@@ -168,9 +168,10 @@ NAMES = {"Exp": "exp", "Log": "log", "Sqrt": "sqrt", "Sin": "sin", "Cos": "cos",
 RULES: dict[str, Rule] = {
     **{op: Rule("f", each(getattr(ca, name))) for op, name in NAMES.items()},
     "Add": Rule("fi", each(ca.plus)), "Sub": Rule("fi", each(ca.minus)), "Mul": Rule("fi", each(ca.times)),
-    "Div": Rule("fi", _divide), "Mod": Rule("fi", _mod), "Pow": Rule("fi", _power), "Neg": Rule("fi", each(lambda x: -x)),
-    "Abs": Rule("fi", each(ca.fabs)), "Sign": Rule("fi", each(ca.sign)), "Round": Rule("f", each(rounded)),
-    "Reciprocal": Rule("f", each(lambda x: 1 / x)), "Sum": Rule("f", _fold(ca.plus)), "Mean": Rule("f", _mean),
+    "Div": Rule("fi", _divide), "Mod": Rule("fi", _mod), "Pow": Rule("fi", _power),
+    "Neg": Rule("fi", each(lambda x: -x)), "Abs": Rule("fi", each(ca.fabs)), "Sign": Rule("fi", each(ca.sign)),
+    "Round": Rule("f", each(rounded)), "Reciprocal": Rule("f", each(lambda x: 1 / x)), "Sum": Rule("f", _fold(ca.plus)),
+    "Mean": Rule("f", _mean),
     "Max": Rule("fi", _fold(larger)), "Min": Rule("fi", _fold(smaller)), "Clip": Rule("fi", _clip),
     "Less": Rule("fi", each(ca.lt, bool)), "LessOrEqual": Rule("fi", each(ca.le, bool)),
     "Greater": Rule("fi", each(ca.gt, bool)), "GreaterOrEqual": Rule("fi", each(ca.ge, bool)),

@@ -39,7 +39,7 @@ def _places(value: Value) -> Any:
 
 
 def _matmul(call: Call) -> Tensor:
-    """numpy's a @ b: matrices in the last two axes, the others broadcast; a vector is a row, or a column on the right."""
+    """numpy's a @ b: matrices in the last two axes, others broadcast; a vector is a row, or a column on the right."""
     a, b = call.args
     if not a.shape or not b.shape:
         raise ValueError(f"it multiplies shapes {a.shape} and {b.shape}; expected at least one axis each")

@@ -65,7 +65,7 @@ def _split(a: Any, call: Call) -> Any:
     if sizes is None:  # equal parts; from opset 18 on the last may be smaller
         n, parts = a.shape[axis], call.options.get("num_outputs", call.outputs)
         step = -(-n // parts) if call.version >= 18 else n // parts
-        sizes = [max(min(step, n - i * step), 0) for i in range(parts)]
+        sizes = [min(step, n - i * step) for i in range(parts)]
     if sum(sizes) != a.shape[axis] or len(sizes) != call.outputs or min(sizes) < 0:
         raise ValueError(f"it splits {a.shape[axis]} numbers into {call.outputs} parts of sizes {sizes}; expected "
                          "sizes that add up, one for each output")
@@ -124,8 +124,8 @@ def _shape(call: Call) -> Any:
 def _constant_of_shape(call: Call) -> Any:
     from onnx.numpy_helper import to_array  # onnx stays out of `import nocl`
 
-    value = np.float32([0]) if "value" not in call.options else to_array(call.options["value"])
-    return np.full(_needed(call.whole(0), "shape"), value.item(), value.dtype)
+    value = np.zeros(1, np.float32) if "value" not in call.options else to_array(call.options["value"])
+    return np.full(tuple(_needed(call.whole(0), "shape")), value.item(), value.dtype)
 
 
 def _from_to(call: Call) -> Any:

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 
 from nocl.exports import onnx_arithmetic, onnx_layers, onnx_moves
-from nocl.exports.onnx_values import Call, Tensor, Value, check_types, known, tensor
+from nocl.exports.onnx_values import Call, Tensor, Value, check_types, known, literal, tensor
 from nocl.exports.onnx_writer import package
 
 RULES = onnx_arithmetic.RULES | onnx_layers.RULES | onnx_moves.RULES
@@ -46,8 +46,9 @@ def from_onnx(path: str | Path, *, outputs: Sequence[str] | None = None, name: s
     inputs = [i for i in graph.input if i.name not in fixed and (i.name in wanted or _is_column(i, onnx))]
     columns = [_input(i, path, onnx) for i in inputs]
     values |= {i.name: v for i, v in zip(inputs, columns, strict=True)} | {"": None}
-    for node in nodes:
-        _run(node, values, model, path)
+    with literal():
+        for node in nodes:
+            _run(node, values, model, path)
     ins = list(in_names or _plain_names([i.name for i in inputs]))
     outs = list(out_names or _plain_names(asked))
     results = [tensor(values[o]).column for o in asked]
@@ -63,7 +64,7 @@ def _loaded(onnx: Any, path: str | Path) -> Any:
     try:
         model = onnx.load(str(path))
         onnx.checker.check_model(model)
-        model = onnx.inliner.inline_local_functions(model) if model.functions else model
+        model = package("onnx.inliner").inline_local_functions(model) if model.functions else model
     except Exception as error:  # protobuf's, onnx's and the file system's
         reason = (str(error) or type(error).__name__).splitlines()[0]
         raise ValueError(f"from_onnx: {path} cannot be read as ONNX ({reason}); expected a .onnx file: export it "

@@ -1,4 +1,4 @@
-"""The numbers of an ONNX graph: columns with a shape and a type where they depend on the inputs, numpy where they do not.
+"""The numbers of an ONNX graph: columns with a shape and a type where they depend on the inputs, else numpy.
 
 A tensor that depends on the inputs is an MX column of its numbers, row-major. Its type is kept beside it, since ONNX
 divides, compares and rounds by type: truths are 0 and 1, whole numbers are exact floats, and a whole number that its
@@ -8,14 +8,14 @@ type or a float64 cannot hold is NaN, for ONNX leaves those undefined.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from threading import Lock
 from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-
-from nocl.support.checks import Array
 
 RANGES = {np.dtype(np.int32): (-(2**31), 2**31 - 1), np.dtype(np.int64): (-(2**53) + 1, 2**53 - 1)}
 TYPES = {np.dtype(t): name for t, name in ((np.float32, "FLOAT"), (np.float64, "DOUBLE"), (np.int32, "INT32"),
@@ -46,6 +46,19 @@ class Tensor:
 
 
 Value = Any  # a Tensor, or a numpy array
+_SIMPLIFICATION = Lock()  # CasADi has one switch for all threads
+
+
+@contextmanager
+def literal() -> Iterator[None]:
+    """Expressions stay as they are written: CasADi makes 1 of x / x and 0 of 0 x, where ONNX has NaN for some x."""
+    with _SIMPLIFICATION:
+        before = ca.GlobalOptions.getSimplificationOnTheFly()
+        ca.GlobalOptions.setSimplificationOnTheFly(False)
+        try:
+            yield
+        finally:
+            ca.GlobalOptions.setSimplificationOnTheFly(before)
 
 
 @dataclass(frozen=True)
@@ -60,7 +73,7 @@ class Call:
     def arg(self, i: int) -> Value | None:
         return self.args[i] if i < len(self.args) else None
 
-    def fixed(self, i: int, attribute: str = "") -> Array | None:
+    def fixed(self, i: int, attribute: str = "") -> Any:
         """An input that says how (a shape, an axis), which earlier opsets had as an attribute; None if left out."""
         value = self.arg(i)
         if isinstance(value, Tensor):
