@@ -288,7 +288,7 @@ def test_only_the_outputs_that_are_asked_for(tmp_path):
     for y, z in zip(f.call([row.ravel()]), (runtime(path, row)[k] for k in (1, 0)), strict=True):
         np.testing.assert_allclose(y.full().ravel(), z.ravel(), rtol=1e-5, atol=1e-6)
     assert from_onnx(path, outputs=mean).n_out() == 1
-    for wrong in ([], ["action"], [mean, mean]):
+    for wrong in ([], ["action"], [mean, mean], 3):
         with pytest.raises(ValueError, match=f"expected names of the outputs of .*: {mean}, {value}, {probability}"):
             from_onnx(path, outputs=wrong)
 
@@ -313,6 +313,8 @@ NORM = {f"w{i}": np.ones(4, np.float32) for i in range(4)}
     ([("Mod", "x x", "y")], {}, {}, "Mod.*expected fmod = 1"),
     ([("Cast", "x", "y", {"to": Kind.UINT8})], {}, {}, "uint8 of numbers that depend on the inputs.*FLOAT"),
     ([("Cast", "x", "y", {"to": Kind.FLOAT16})], {}, {}, "float16 of numbers that depend"),
+    ([("Cast", "x", "y", {"to": Kind.BFLOAT16})], {}, {}, "it makes BFLOAT16; expected one of FLOAT"),
+    ([("Cast", "c", "y", {"to": Kind.BFLOAT16})], {"c": np.float32(1.7)}, {}, "it makes BFLOAT16"),
     ([("Cast", "c", "i", {"to": Kind.INT32}), ("Identity", "i", "y")], {"c": np.float32(3e10)}, {},
      "beyond what int32"),
     ([("Cast", "x", "i", {"to": Kind.INT64}), ("Add", "x i", "y")], {}, {},
@@ -321,6 +323,7 @@ NORM = {f"w{i}": np.ones(4, np.float32) for i in range(4)}
     ([("Add", "n n", "y")], {"n": np.int64(2**60)}, {}, "which float64 does not hold exactly"),
     ([("Div", "n zero", "y")], {"n": np.int64(3), "zero": np.int64(0)}, {}, "no whole number"),
     ([("ArgMax", "x", "i", {"axis": 1}), ("Gather", "x i", "y")], {}, {}, r"\(Gather\).*depends on the inputs"),
+    ([("Squeeze", "x none", "y")], {"none": np.int64([])}, {}, "Squeeze.*read in two ways"),
     ([("RandomNormalLike", "x", "y")], {}, {}, r"\(RandomNormalLike\) of .* has no translation .*l4casadi"),
     ([("Multinomial", "x", "z"), ("Add", "x x", "y")], {}, {"outputs": "y z"}, r"Multinomial.*outputs=\['y'\]"),
     ([("Split", "x", "y z", {"num_outputs": 3, "axis": 1})], {}, {"outputs": "y z"}, "Split.*one for each output"),

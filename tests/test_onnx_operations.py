@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import zlib
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -411,3 +412,9 @@ def test_each_operation_equals_onnx_runtime(tmp_path, op, version, kind):
                     same(tmp_path / "g.onnx", model, expected, rows, dtype is np.float32 or op == "Gelu")
                     compared += 1
     assert compared, f"ONNX Runtime has no {op} of opset {version} for {kind}"
+
+
+def test_the_documentation_names_what_is_read():
+    text = (Path(__file__).parents[1] / "docs" / "export.md").read_text()
+    table = text[text.index("| kind | operations |"):].split("\n\n")[0]
+    assert sorted(op for line in table.splitlines()[2:] for op in line.split("|")[2].split()) == sorted(RULES)

@@ -15,11 +15,11 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from nocl.exports import onnx_arithmetic, onnx_layers, onnx_moves
-from nocl.exports.onnx_values import Call, Tensor, Value, check_types, known, literal, tensor
+from nocl.exports.onnx_operations import arithmetic, layers, moves
+from nocl.exports.onnx_operations.values import Call, Tensor, Value, check_types, known, literal, tensor
 from nocl.exports.onnx_writer import package
 
-RULES = onnx_arithmetic.RULES | onnx_layers.RULES | onnx_moves.RULES
+RULES = arithmetic.RULES | layers.RULES | moves.RULES
 OLDEST, NEWEST = 7, 27  # opsets whose meanings are compared with ONNX Runtime; before 7 broadcasting was another
 
 
@@ -41,19 +41,23 @@ def from_onnx(path: str | Path, *, outputs: Sequence[str] | None = None, name: s
     graph = model.graph
     asked = _asked([o.name for o in graph.output], outputs, path)
     nodes, wanted = _needed(graph, asked)
-    values: dict[str, Value] = {i.name: onnx.numpy_helper.to_array(i) for i in graph.initializer if i.name in wanted}
-    fixed = {i.name for i in graph.initializer}
-    inputs = [i for i in graph.input if i.name not in fixed and (i.name in wanted or _is_column(i, onnx))]
-    columns = [_input(i, path, onnx) for i in inputs]
-    values |= {i.name: v for i, v in zip(inputs, columns, strict=True)} | {"": None}
+    fixed = {i.name: i for i in graph.initializer}
+    inputs = {i.name: _input(i, path, onnx) for i in graph.input
+              if i.name not in fixed and (i.name in wanted or _is_column(i, onnx))}
+    values = {n: _weights(i, path, onnx) for n, i in fixed.items() if n in wanted} | inputs | {"": None}
     with literal():
         for node in nodes:
             _run(node, values, model, path)
-    ins = list(in_names or _plain_names([i.name for i in inputs]))
-    outs = list(out_names or _plain_names(asked))
     results = [tensor(values[o]).column for o in asked]
+    return _function(name, [c.column for c in inputs.values()], results, in_names or _plain_names(list(inputs)),
+                     out_names or _plain_names(asked))
+
+
+def _function(name: str, columns: list[ca.MX], results: list[ca.MX], in_names: Sequence[str],
+              out_names: Sequence[str]) -> ca.Function:
+    ins, outs = list(in_names), list(out_names)
     try:
-        return ca.Function(name, [c.column for c in columns], [ca.densify(r) for r in results], ins, outs)
+        return ca.Function(name, columns, [ca.densify(r) for r in results], ins, outs)
     except (RuntimeError, NotImplementedError) as error:
         raise ValueError(f"from_onnx: name={name!r}, in_names={ins}, out_names={outs} do not make a Function of "
                          f"{len(columns)} inputs and {len(results)} outputs: give each a plain name") from error
@@ -81,7 +85,8 @@ def _opset(model: Any) -> int:
 
 
 def _asked(there: list[str], outputs: Sequence[str] | None, path: Any) -> list[str]:
-    asked = there if outputs is None else [outputs] if isinstance(outputs, str) else list(outputs)
+    asked = there if outputs is None else [outputs] if isinstance(outputs, str) else outputs
+    asked = list(asked) if isinstance(asked, list | tuple) else []
     if not asked or any(name not in there for name in asked) or len(set(asked)) < len(asked):
         raise ValueError(f"from_onnx: outputs is {outputs!r}; expected names of the outputs of {path}, each once: "
                          f"{', '.join(there)}")
@@ -132,6 +137,14 @@ def _input(value: Any, path: Any, onnx: Any) -> Tensor:
                          "expected FLOAT or DOUBLE: export the network with real inputs, and cast inside")
     dtype = onnx.helper.tensor_dtype_to_np_dtype(element)
     return Tensor(ca.MX.sym("x", math.prod(shape)), tuple(shape), dtype)
+
+
+def _weights(stored: Any, path: Any, onnx: Any) -> Value:
+    try:
+        return onnx.numpy_helper.to_array(stored)
+    except (ValueError, LookupError, TypeError) as error:
+        raise ValueError(f"from_onnx: the constant {stored.name!r} of {path} cannot be read ({error}); expected "
+                         "numbers of a type and a shape that fit: export the network again") from error
 
 
 def _run(node: Any, values: dict[str, Value], model: Any, path: Any) -> None:

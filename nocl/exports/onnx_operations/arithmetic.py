@@ -14,7 +14,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from nocl.exports.onnx_values import RANGES, Call, Rule, Tensor, Value, cast, each, elementwise, if_else, truncated
+from nocl.exports.onnx_operations.values import RANGES, Call, Rule, Tensor, Value, cast, each, elementwise, if_else, truncated
 
 
 def larger(a: ca.MX, b: ca.MX) -> ca.MX:
@@ -99,6 +99,8 @@ def _bound(call: Call, i: int, name: str) -> Value:
     """An input from opset 11 on, an attribute before; left out it is the last finite number of the type."""
     dtype, given = call.args[0].dtype, call.arg(i)
     if given is not None:
+        if math.prod(given.shape) != 1:
+            raise ValueError(f"its {name} has the shape {given.shape}; expected a single number")
         return given
     limits = RANGES[dtype] if dtype.kind == "i" else (np.finfo(dtype).min, np.finfo(dtype).max)
     return np.asarray(call.options.get(name, limits[i - 1]), dtype)
@@ -134,8 +136,12 @@ def selu(x: ca.MX, alpha: float, gamma: float) -> ca.MX:
     return gamma * elu(x, alpha)
 
 
+def relu(x: ca.MX) -> ca.MX:
+    return if_else(x <= 0, 0, x)  # slope 0 at 0, as torch has it
+
+
 def leaky(x: ca.MX, alpha: float) -> ca.MX:
-    return if_else(x < 0, alpha * x, x)
+    return if_else(x <= 0, alpha * x, x)
 
 
 def hard_sigmoid(x: ca.MX, alpha: float, beta: float) -> ca.MX:
@@ -157,11 +163,15 @@ def shrink(x: ca.MX, lambd: float, bias: float) -> ca.MX:
 
 
 def _cast(call: Call) -> Value:
-    from onnx.helper import tensor_dtype_to_np_dtype  # onnx stays out of `import nocl`
+    from onnx import TensorProto, helper  # onnx stays out of `import nocl`
 
-    return cast(call.args[0], tensor_dtype_to_np_dtype(call.options["to"]))
+    name = TensorProto.DataType.Name(call.options["to"])
+    if name not in NUMPY:  # older versions of onnx call bfloat16 float32
+        raise ValueError(f"it makes {name}; expected one of {', '.join(NUMPY)}: export the network in float32")
+    return cast(call.args[0], helper.tensor_dtype_to_np_dtype(call.options["to"]))
 
 
+NUMPY = ("FLOAT", "DOUBLE", "FLOAT16", "BOOL", "INT8", "INT16", "INT32", "INT64", "UINT8", "UINT16", "UINT32", "UINT64")
 NAMES = {"Exp": "exp", "Log": "log", "Sqrt": "sqrt", "Sin": "sin", "Cos": "cos", "Tan": "tan", "Asin": "asin",
          "Acos": "acos", "Atan": "atan", "Sinh": "sinh", "Cosh": "cosh", "Tanh": "tanh", "Asinh": "asinh",
          "Acosh": "acosh", "Atanh": "atanh", "Erf": "erf", "Floor": "floor", "Ceil": "ceil"}
@@ -179,7 +189,7 @@ RULES: dict[str, Rule] = {
     "And": Rule("b", each(ca.logic_and)), "Or": Rule("b", each(ca.logic_or)), "Xor": Rule("b", each(ca.ne)),
     "IsNaN": Rule("f", each(lambda x: ca.logic_not(x <= math.inf), bool)), "IsInf": Rule("f", _is_inf),
     "Cast": Rule("*", _cast), "CastLike": Rule("*", lambda call: cast(call.args[0], call.args[1].dtype)),
-    "Relu": Rule("fi", each(positive)), "Sigmoid": Rule("f", each(sigmoid)), "Softplus": Rule("f", each(softplus)),
+    "Relu": Rule("fi", each(relu)), "Sigmoid": Rule("f", each(sigmoid)), "Softplus": Rule("f", each(softplus)),
     "Softsign": Rule("f", each(lambda x: x / (1 + ca.fabs(x)))), "HardSwish": Rule("f", each(hard_swish)),
     "HardSigmoid": Rule("f", _activation(hard_sigmoid, "alpha", "beta")), "Elu": Rule("f", _activation(elu, "alpha")),
     "Selu": Rule("f", _activation(selu, "alpha", "gamma")), "Celu": Rule("f", _activation(celu, "alpha")),

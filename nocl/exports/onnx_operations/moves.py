@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from nocl.exports.onnx_values import Call, Rule, Tensor, Value, tensor
+from nocl.exports.onnx_operations.values import Call, Rule, Tensor, Value, tensor
 
 
 def _moving(move: Callable[[Any, Call], Any]) -> Callable[[Call], Any]:
@@ -74,6 +74,8 @@ def _split(a: Any, call: Call) -> Any:
 
 def _squeeze(a: Any, call: Call) -> Any:
     axes = call.whole(1, "axes")
+    if axes == []:  # onnx takes away no axis, ONNX Runtime all of size 1
+        raise ValueError("its axes are an empty list, which is read in two ways; expected axes, or none given")
     return np.squeeze(a, None if axes is None else tuple(axes))
 
 

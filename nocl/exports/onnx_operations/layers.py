@@ -9,8 +9,8 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from nocl.exports.onnx_arithmetic import larger, smaller
-from nocl.exports.onnx_values import Call, Rule, Tensor, Value, elementwise, held, if_else, tensor
+from nocl.exports.onnx_operations.arithmetic import larger, smaller
+from nocl.exports.onnx_operations.values import Call, Rule, Tensor, Value, elementwise, held, if_else, tensor
 
 # Products
 
@@ -211,7 +211,8 @@ def _batch_norm(call: Call) -> Tensor:
                          "[batch, channels, ...]: export it with opset 9 or later")
     along = (-1, *[1] * (len(x.shape) - 2))  # the channels are the second axis
     scale, shift, mean, variance = (np.reshape(v, along).astype(np.float64) for v in (scale, shift, mean, variance))
-    gain = scale / np.sqrt(variance + call.options["epsilon"])
+    with np.errstate(invalid="ignore"):  # a negative variance makes NaN, there as here
+        gain = scale / np.sqrt(variance + call.options["epsilon"])
     return elementwise(lambda x, mean, gain, shift: (x - mean) * gain + shift, x, mean, gain, shift)
 
 
