@@ -14,7 +14,18 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from nocl.exports.onnx_operations.values import RANGES, Call, Rule, Tensor, Value, cast, each, elementwise, if_else, truncated
+from nocl.exports.onnx_operations.values import (
+    RANGES,
+    Call,
+    Rule,
+    Tensor,
+    Value,
+    cast,
+    each,
+    elementwise,
+    if_else,
+    truncated,
+)
 
 
 def larger(a: ca.MX, b: ca.MX) -> ca.MX:
