@@ -115,6 +115,9 @@ def policy_function(ocp: OCP, controller: Any) -> ca.Function | None:
     """The policy (x, t) -> u as a casadi.Function, or None where the controller has none; one of x alone gets a t."""
     s = ocp.system
     g = controller if isinstance(controller, ca.Function) else _converted(controller)
+    if g is not None and g.n_out() != 1:
+        raise ValueError(f"the policy {g.name()} returns {', '.join(g.name_out())}; {s.name} needs one output, u: pick "
+                         "it (of an ONNX file with from_onnx(path, outputs=[...]))")
     if g is not None and [g.numel_in(i) for i in range(g.n_in())] == [s.nx]:
         at = ocp.functions.feedback(ca.MX)
         g = at.function(g.name(), {"u": g(at["x"] if g.size2_in(0) == 1 else at["x"].T)})

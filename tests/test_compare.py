@@ -244,6 +244,9 @@ def test_an_imported_onnx_policy_is_a_method(ocp, tmp_path):
     gain = lambda x, t: x @ np.array([[-1.0], [-2.0]])  # noqa: E731
     report = compare(ocp, {"ONNX": from_onnx(path), "by hand": gain}, n=2, hold=[30], progress=False)
     np.testing.assert_allclose(report.cost[0], report.cost[1], rtol=1e-9)
+    x = ca.MX.sym("x", 2)
+    with pytest.raises(ValueError, match=r"returns action, value; .* needs one output, u: .*outputs="):
+        nocl.simulate(ocp, ca.Function("pi", [x], [-x[0], x[1]], ["x"], ["action", "value"]), [[1.0, 0.0]])
 
 
 def test_ddp_counts_what_it_evaluated(ocp):

@@ -116,9 +116,10 @@ def test_activations(tmp_path, op):
 
 
 @pytest.mark.parametrize(("nodes", "options", "message"), [
-    ([(("Softmax", ["obs.1"], ["action"]), {})], {}, r"\(Softmax\) of .* has no translation .*l4casadi"),
-    ([(("MatMul", ["obs.1", "obs.1"], ["action"]), {})], {"n": 1}, "one row times a fixed matrix"),
-    ([(("ReduceMean", ["obs.1"], ["action"]), {"axes": [0]})], {}, "reduces over a part of the row"),
+    ([(("RandomNormalLike", ["obs.1"], ["action"]), {})], {},
+     r"\(RandomNormalLike\) of .* has no translation .*l4casadi"),
+    ([(("MatMul", ["obs.1", "obs.1"], ["action"]), {})], {}, r"\(MatMul\) of .* expected equal inner sizes"),
+    ([(("ReduceMean", ["obs.1"], ["action"]), {"axes": [2]})], {}, r"its axes are \[2\]; expected them in \[-2, 1\]"),
 ])
 def test_refusals_name_the_node(tmp_path, nodes, options, message):
     with pytest.raises(ValueError, match=message):
