@@ -19,7 +19,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from nocl.comparisons.report.results import OPEN_LOOP, Plan, count
+from nocl.comparisons.report.results import Plan, count
 from nocl.data import Solution
 from nocl.judge import policy_function
 from nocl.ocp import OCP
@@ -36,11 +36,16 @@ class Run:
     """One method at one rate."""
 
     name: str
-    how: str
+    how: str  # in words
     method: Any  # as it was given
     controller: Any  # what the judge runs: a casadi.Function, a callable, or controls [B, K, nu], NaN where unsolved
     hold: int | None = None
     solved: Solved | None = None
+
+    @property
+    def held(self) -> bool:
+        """Whether its controls are held between nodes: of plans they always are."""
+        return self.hold is not None or self.solved is not None
 
     @property
     def identity(self) -> Any:
@@ -254,7 +259,7 @@ def planned(ocp: OCP, name: str, method: Any, parts: Sequence[tuple[Any, float] 
         message += _unsolved(ocp, s)
     u[[bool(m) for m in message]] = np.nan
     solved = Solved(ms, solves, predicted, evaluations, plan, message)
-    return Run(name, f"{OPEN_LOOP}, held on {count(K, 'interval')}", method, u, solved=solved)
+    return Run(name, f"open loop, held on {count(K, 'interval')}", method, u, solved=solved)
 
 
 def _unsolved(ocp: OCP, solution: Any) -> list[str]:
