@@ -33,7 +33,7 @@ def dots(panels: Mapping[str, Sequence[Dot]], labels: Sequence[str], what: str) 
             _panel(axes, shown)
             axes.set(title=problem, xlabel=what)
         row[0].set_yticks(range(len(labels)), labels)
-        row[0].invert_yaxis()
+        row[0].set_ylim(len(labels) - 0.5, -0.5)  # the first at the top
         handles = [row[0].plot([], [], "o", ms=4, color=COLOURS[0])[0],
                    row[0].plot([], [], "o", mfc="none", color=COLOURS[1])[0]]
         drawing.legend(handles, ["nocl, over the seeds", "the paper"], loc="outside lower center", ncols=2)

@@ -77,10 +77,15 @@ def add_tables(sub: argparse.ArgumentParser) -> None:
             one.add_argument(*names, type=kind, metavar=metavar, help=what + text)
 
 
+def table_of(name: str) -> Any:
+    """The table itself, a nocl.comparisons.reproduce.table.Table."""
+    module, _, variable = TABLES[name].made_by.partition(":")
+    return getattr(import_module(module), variable)
+
+
 def run(args: argparse.Namespace) -> None:
     """Make a table's cells, write what the folder holds, and print it."""
-    module, _, name = TABLES[args.table].made_by.partition(":")
-    table = getattr(import_module(module), name)
+    table = table_of(args.table)
     given = {flag.removeprefix("--").replace("-", "_") for flag in (*TABLES[args.table].flags, "--shipped")}
     plan = table.plan(args.quick, **{field: getattr(args, field, None) for field in given})
     table.places(plan)
