@@ -83,7 +83,7 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--solver", choices=registry.solvers(), default="nmpc", metavar="NAME",
                      help=f"default: nmpc; {_told_of(registry.solvers())}")
     sub.add_argument("--workers", type=arguments.workers, default="auto", metavar="W",
-                     help="of NMPC's processes or DDP's threads, auto, or a Dask scheduler's tcp://...; default: auto")
+                     help="processes or threads of the solver, auto, or a Dask scheduler's tcp://...; default: auto")
     sub = command("export", _export, "write a run's controller, value function and dynamics, proven equal to it")
     _add(sub, "run")
     sub.add_argument("--to", choices=arguments.FORMS, action="append",
