@@ -27,8 +27,8 @@ class Method:
     """An entry.
 
     `make` is called as make(ocp, **options) and returns feedback or a solver, as nocl.comparisons.methods has them.
-    Where that takes long (a training, a grid), `check` is called first and alike: ValueError for a problem that the
-    method is not for. Elsewhere making it is the check.
+    Where that takes long (a training, a grid), check(ocp) is called first: ValueError for a problem that the method is
+    not for. Elsewhere making it is the check.
     """
 
     name: str  # at the command line, and of files
@@ -51,17 +51,16 @@ class Method:
         """ValueError, without long work, where the method cannot be made for this problem."""
         if self.missing:
             raise ValueError(self.missing)
-        if self.make:
-            self._called(self.check or self.make, ocp, options)
+        if self.check:
+            _function(self.check)(ocp)
+        elif self.make:
+            self.build(ocp, options)
 
     def build(self, ocp: OCP, options: Options) -> Any:
         """The method for this problem."""
         if self.missing:
             raise ValueError(self.missing)
-        return self._called(self.make, ocp, options)
-
-    def _called(self, name: str, ocp: OCP, options: Options) -> Any:
-        return _function(name)(ocp, **{option: getattr(options, option) for option in self.takes})
+        return _function(self.make)(ocp, **{option: getattr(options, option) for option in self.takes})
 
 
 def _function(name: str) -> Callable[..., Any]:
