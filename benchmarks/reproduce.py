@@ -19,10 +19,14 @@ from typing import Any
 import numpy as np
 import provenance
 
-from nocl.comparisons.reproduce import approaches, control, dubins
+from nocl.comparisons.reproduce import approaches, dubins
+from nocl.comparisons.reproduce.control import GYM_TABLE, QUADROTOR_TABLE
+from nocl.comparisons.reproduce.controllers import Cell
+
+CONTROL = {table.name: table for table in (GYM_TABLE, QUADROTOR_TABLE)}
 
 
-def summary(cell: control.Cell) -> dict[str, Any]:
+def summary(cell: Cell) -> dict[str, Any]:
     """A cell without its initial states: mean, standard deviation and worst over those that did not fail."""
     row: dict[str, Any] = {"problem": cell.problem, "way": cell.way, "seed": cell.seed, "key": cell.key,
                            "failed": int((~np.isfinite(cell.error)).sum()), "made": cell.made}
@@ -49,15 +53,15 @@ def digits(x: float) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("table", choices=[*control.TABLES, "dubins", "approaches"])
+    parser.add_argument("table", choices=[*CONTROL, "dubins", "approaches"])
     parser.add_argument("run", type=Path)
     options = parser.parse_args()
     if options.table == "dubins":
-        rows = [plain(entry) for entry in dubins.table(dubins.finished(options.run))]
+        rows = [plain(entry) for entry in dubins.TABLE.entries(dubins.TABLE.finished(options.run))]
     elif options.table == "approaches":
-        rows = [plain(cell) for cell in approaches.finished(options.run)]
+        rows = [plain(cell) for cell in approaches.TABLE.finished(options.run)]
     else:
-        rows = [summary(cell) for cell in control.finished(options.run, options.table)]
+        rows = [summary(cell) for cell in CONTROL[options.table].finished(options.run)]
     print(provenance.write(f"reproduce_{options.table}", rows, cells=f"nocl reproduce {options.table}"))
 
 

@@ -213,7 +213,7 @@ def draw(rows: list[dict[str, Any]], path: Path) -> None:
 
 def table(run: Path) -> None:
     """Finished cells, with what they were made with."""
-    provenance.write("sysid", [asdict(cell) for cell in sysid.finished(run)], held_out=sysid.HELD_OUT)
+    provenance.write("sysid", [asdict(cell) for cell in sysid.TABLE.finished(run)], held_out=sysid.HELD_OUT)
 
 
 def main() -> None:

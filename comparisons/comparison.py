@@ -79,7 +79,7 @@ def _judged(run: Run, judgement: Judgement, x0: Array) -> Judged:
     solves = np.ones(len(x0)) if solved is None else solved.solves
     predicted = _predicted(run.method, x0) if solved is None else solved.predicted
     return Judged(run.name, run.how, s, judgement.ms_first, judgement.ms_per_control, judgement.evaluations, solves,
-                  predicted, None if solved is None else solved.plan, _value(run.method, predicted))
+                  predicted, None if solved is None else solved.plan, _value(run.method, predicted), run.held)
 
 
 def _value(method: Any, predicted: Array) -> Any:

@@ -19,7 +19,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from nocl.comparisons.report.results import OPEN_LOOP, Plan, count
+from nocl.comparisons.report.results import Plan, count
 from nocl.data import Solution
 from nocl.judge import check_made_for, policy_function
 from nocl.ocp import OCP
@@ -36,11 +36,16 @@ class Run:
     """One method at one rate."""
 
     name: str
-    how: str
+    how: str  # in words
     method: Any  # as it was given
     controller: Any  # what the judge runs: a casadi.Function, a callable, or controls [B, K, nu], NaN where unsolved
     hold: int | None = None
     solved: Solved | None = None
+
+    @property
+    def held(self) -> bool:
+        """Whether its controls are held between nodes: of plans they always are."""
+        return self.hold is not None or self.solved is not None
 
     @property
     def identity(self) -> Any:
@@ -121,14 +126,14 @@ def _check(ocp: OCP, name: str, method: Any, x0: Array) -> None:
                          "casadi.Function (x, t) -> u, a solver with solve(x0), a Solution, or a callable (x, t) -> u")
 
 
-def _is_plan(method: Any) -> bool:
+def is_plan(method: Any) -> bool:
     """Whether it is run open loop."""
     return isinstance(method, Solution) or \
         (hasattr(method, "solve") and not hasattr(method, "to_casadi") and not isinstance(method, ca.Function))
 
 
 def _names(ocp: OCP, name: str, method: Any, rates: Rates) -> list[str]:
-    if _is_plan(method):
+    if is_plan(method):
         return [name]
     if _policy(ocp, name, method) is not None:
         return [_held_name(name, rate) for rate in rates]
@@ -142,7 +147,7 @@ def _held_name(name: str, rate: int | None) -> str:
 
 def _runs(ocp: OCP, name: str, method: Any, x0: Array, rates: Rates, solving: Solving) -> list[Run]:
     names = _names(ocp, name, method, rates)
-    if _is_plan(method):
+    if is_plan(method):
         parts = [(method, np.nan)] if isinstance(method, Solution) else solve(method, name, x0, solving)
         return [planned(ocp, name, method, parts, len(x0))]
     policy = _policy(ocp, name, method)
@@ -167,6 +172,11 @@ def _sampled(method: Any, rates: Rates) -> list[int]:
     """Intervals for sampled feedback: as asked for, the method's own (NMPC's loop has a `hold`), or SAMPLED."""
     own = getattr(method, "hold", None)
     return [rate for rate in rates if rate is not None] or [int(own) if is_count(own) else SAMPLED]  # type: ignore[arg-type]
+
+
+def own_rate(ocp: OCP, method: Any) -> int | None:
+    """Intervals that feedback is held on where no rate is asked for; None: continuous."""
+    return None if policy_function(ocp, method) is not None else _sampled(method, (None,))[0]
 
 
 def _policy(ocp: OCP, name: str, method: Any) -> ca.Function | None:
@@ -255,7 +265,7 @@ def planned(ocp: OCP, name: str, method: Any, parts: Sequence[tuple[Any, float] 
         message += _unsolved(ocp, s)
     u[[bool(m) for m in message]] = np.nan
     solved = Solved(ms, solves, predicted, evaluations, plan, message)
-    return Run(name, f"{OPEN_LOOP}, held on {count(K, 'interval')}", method, u, solved=solved)
+    return Run(name, f"open loop, held on {count(K, 'interval')}", method, u, solved=solved)
 
 
 def _unsolved(ocp: OCP, solution: Any) -> list[str]:

@@ -261,6 +261,12 @@ def train_neural_oc(ocp: OCP, settings: NeuralOCSettings | None = None, *, dynam
     return NeuralOC(ocp, net, card)
 
 
+def applicable(ocp: OCP) -> None:
+    """ValueError, at once, for a problem that NeuralOC is not for: see train_neural_oc."""
+    _minimiser(ocp)
+    _scale(ocp)
+
+
 class _Trainer:
     """One training: the problem in torch, its network and random numbers, the best network so far."""
 

@@ -31,6 +31,7 @@ try:
 except ImportError as error:
     raise ImportError(f"RRT* needs OMPL ({error}): pip install 'nocl[ompl]'") from error
 
+ITERATIONS = 200  # of `standard`: the larger of the paper's two budgets
 PROBES = 256  # points at which f is compared with a car's
 SLACK = 1e-6  # of a path's driving speed over the car's largest
 
@@ -177,6 +178,11 @@ class RRTStar:
     def _none(self, iterations: int, seconds: float, why: str) -> Path:
         return Path(np.full((self.intervals + 1, 3), np.nan), np.full(self.intervals, np.nan), math.inf, iterations,
                     seconds, why)
+
+
+def standard(ocp: OCP, seed: int) -> RRTStar:
+    """RRT* as the command line makes it."""
+    return RRTStar(ocp, iterations=ITERATIONS, seed=seed)
 
 
 def _car(ocp: OCP) -> tuple[float, float, float]:

@@ -73,9 +73,9 @@ BAD = [
     ("run cubic.py --seed 1.5", "at least 0"),
     ("run cubic.py --intervals 0", "at least 1"),
     ("run cubic.py --intervals 1", "intervals"),
-    ("run cubic.py --methods CND,MAGIC", "CND, NMPC, LQR, DDP"),
-    ("run cubic.py --methods CND,CND", "CND, NMPC, LQR, DDP"),
-    ("run cubic.py --methods=", "CND, NMPC, LQR, DDP"),
+    ("run cubic.py --methods CND,MAGIC", "cnd, nmpc, lqr, ddp"),
+    ("run cubic.py --methods CND,CND", "cnd, nmpc, lqr, ddp"),
+    ("run cubic.py --methods=", "cnd, nmpc, lqr, ddp"),
     ("run cubic.py --out notes.txt", "is a file"),
     ("run cubic.py --out notes.txt/deeper", "is a file"),
     ("run cubic.py --out half", "is a file"),
@@ -309,7 +309,7 @@ def test_a_run_from_a_users_file_to_its_report(here, capsys, monkeypatch):
     assert main(["compare", "out", "--n", "2", "--methods", "CND,DDP", "--hold", "20", "--out", "elsewhere"]) == 0
     out = capsys.readouterr().out
     assert "CND (20 holds)" in out
-    assert "drawn with seed 2" in out  # one more than that of the run
+    assert "on 2 initial states, drawn with seed 2" in out  # one more than that of the run
     assert main(["compare", "out", "--n", "2", "--methods", "CND", "--seed", "7"]) == 0
     assert "drawn with seed 8" in capsys.readouterr().out
     assert (here / "elsewhere" / "report.html").is_file()

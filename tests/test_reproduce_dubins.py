@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 import nocl
-from nocl.comparisons.reproduce import approaches, dubins, dubins_tables
+from nocl.comparisons.reproduce import approaches, dubins
+from nocl.comparisons.reproduce.dubins import TABLE
 
 X0 = np.array([[-3.0, 1.0, 0.0], [-3.0, -1.0, 0.0]])
 
@@ -79,11 +80,11 @@ def test_both_sides_and_both_turning_directions_are_taken_each_where_it_is_bette
 def test_success_needs_the_goal_and_the_obstacle():
     made = cell("cnd", [4.0] * 3, [1.0] * 3, [0.05, 0.2, 0.05], [0.1, 0.1, -0.01])
     assert made.success.tolist() == [True, False, False]
-    assert dubins.table([made])[0].collisions == 1
+    assert TABLE.entries([made])[0].collisions == 1
 
 
 def test_the_table_compares_with_the_optimum_of_the_same_states():
-    entries = {e.way: e for e in dubins.table([CND, OPTIMUM])}
+    entries = {e.way: e for e in TABLE.entries([CND, OPTIMUM])}
     assert list(entries) == ["cnd", "optimum"]
     assert entries["cnd"].success == pytest.approx(2 / 3)
     assert entries["cnd"].length == pytest.approx(4.3)
@@ -92,18 +93,18 @@ def test_the_table_compares_with_the_optimum_of_the_same_states():
     assert entries["cnd"].ratio == pytest.approx(4.3 / 4.0)
     assert entries["optimum"].gap == pytest.approx(0.0)
     assert entries["cnd"].gap95 == pytest.approx(9.75)  # of 5 and 10 %
-    assert math.isnan(dubins.table([CND])[0].gap)
+    assert math.isnan(TABLE.entries([CND])[0].gap)
 
 
 def test_tables_and_figure(tmp_path):
-    paths = dubins_tables.write(tmp_path, [cell("rrt-100", [5.0], [0.1], [0.0], [0.2]), CND, OPTIMUM])
+    paths = TABLE.write(tmp_path, [cell("rrt-100", [5.0], [0.1], [0.0], [0.2]), CND, OPTIMUM])
     assert [p.name for p in paths] == ["dubins.md", "dubins.tex", "dubins.csv", "dubins.png"]
     text = paths[0].read_text()
     assert "4.887 ± 0.961" in text  # the paper's RRT*
     rows = list(csv.DictReader(io.StringIO(paths[2].read_text())))
     assert float(rows[0]["paper_success"]) == 0.889
     assert rows[1]["paper_success"] == ""
-    (x, y), radius = dubins_tables._obstacle()
+    (x, y), radius = dubins.obstacle()
     assert (x, y, radius) == pytest.approx((-1.0, 0.0, 0.5), abs=2e-3)
 
 
@@ -116,41 +117,41 @@ def test_cells_are_kept_and_made_anew_for_another_plan(tmp_path, monkeypatch):
 
     monkeypatch.setitem(dubins.WAYS, "nmpc", replace(dubins.WAYS["nmpc"], make=way))
     plan = dubins.Plan(n=3, ways=("nmpc",))
-    (first,) = dubins.run(tmp_path, plan, progress=False)
-    (again,) = dubins.run(tmp_path, plan, progress=False)
+    (first,) = TABLE.run(tmp_path, plan, progress=False)
+    (again,) = TABLE.run(tmp_path, plan, progress=False)
     assert made == [3]
     assert again == first
-    dubins.run(tmp_path, replace(plan, n=4), progress=False)
+    TABLE.run(tmp_path, replace(plan, n=4), progress=False)
     assert made == [3, 4]
-    assert len(dubins.finished(tmp_path)) == 1
+    assert len(TABLE.finished(tmp_path)) == 1
     (tmp_path / "cells" / "dubins-nmpc-0.json").write_text("{}")
     with pytest.raises(ValueError, match="no cell of the Dubins table"):
-        dubins.run(tmp_path, plan, progress=False)
+        TABLE.run(tmp_path, plan, progress=False)
 
 
 def test_plans_are_checked():
     with pytest.raises(ValueError, match="some of rrt-100"):
-        dubins.Plan(ways=("prm",))
+        TABLE.places(dubins.Plan(ways=("prm",)))
     with pytest.raises(ValueError, match="n is 0"):
-        dubins.Plan(n=0)
+        TABLE.places(dubins.Plan(n=0))
     with pytest.raises(ValueError, match="problems are"):
-        approaches.Plan(problems=("boat",))
+        approaches.TABLE.places(approaches.Plan(problems=("boat",)))
 
 
 def test_approaches_level_sets_end_where_memory_does(tmp_path):
     pytest.importorskip("hj_reachability")
     plan = approaches.Plan(nodes=11, states=8, problems=("double_integrator", "quadrotor"))
-    small = approaches.MAKERS["level-sets"]("double_integrator", plan)
-    large = approaches.MAKERS["level-sets"]("quadrotor", plan)
+    small = approaches.WAYS["level-sets"].make("double_integrator", plan)
+    large = approaches.WAYS["level-sets"].make("quadrotor", plan)
     assert small.memory < 10
     assert small.ms > 0
     assert 0 < small.error < 1
-    fine = approaches.MAKERS["level-sets"]("double_integrator", replace(plan, nodes=41))
+    fine = approaches.WAYS["level-sets"].make("double_integrator", replace(plan, nodes=41))
     assert fine.error < 0.5 * small.error
     assert math.isnan(large.error)
     assert large.memory > 1e7  # MB
     assert "not possible" in large.note
-    paths = approaches.write(tmp_path, [small, large])
+    paths = approaches.TABLE.write(tmp_path, [small, large])
     assert [p.suffix for p in paths] == [".md", ".tex", ".csv", ".png"]
     assert paths[3].read_bytes().startswith(b"\x89PNG")
     text = paths[0].read_text()

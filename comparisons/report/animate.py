@@ -103,7 +103,7 @@ def _set_up(report: Results, i: int, chosen: Sequence[int], draw: Draw) -> tuple
         clock.set_text(plain(f"{ocp.system.name}, initial state {i}, t = {t:.2f}"))
         artists = [clock]
         for m, move, plot in parts:
-            s, held = report.judged[m].simulation, "held" in report.judged[m].how
+            s, held = report.judged[m].simulation, report.judged[m].held
             x, u = so_far(s.t, s.x[i], t), so_far(s.t, s.u[i], t, held)
             artists += [*move(x, u[-1], t), *plot(s.t, u, t, held)]
         return artists

@@ -97,7 +97,7 @@ def trajectories(report: Results, states: Sequence[int]) -> Figure:
         axes[-1, c].set_xlabel("t")
         for m, judged in enumerate(report.judged):
             _draw_run(axes[:, c], judged.simulation.t, judged.simulation.x[i], judged.simulation.u[i], m, judged.name,
-                      steps="held" in judged.how)
+                      steps=judged.held)
         for ax, goal in zip(axes[:, c], np.r_[report.ocp.x_goal, report.ocp.u_goal], strict=True):
             ax.axhline(goal, color="0.6", linewidth=0.7, zorder=0)
     for ax, name in zip(axes[:, 0], names, strict=True):

@@ -31,6 +31,12 @@ TIMES = (0.0, 0.5, 0.9)  # of the horizon that V is drawn at
 GRID = 41  # points of a slice of V in each direction
 OUTLINE = 121  # points of the grid that an obstacle's edge is found on, in each direction
 MARGIN = 0.15  # of what runs visit, about a slice
+# numbers of a method and state, by the names that the page looks them up by
+NUMBERS: dict[str, Callable[[Judged], Array]] = {
+    "cost": lambda j: j.simulation.cost, "running": lambda j: j.simulation.running_cost,
+    "terminal": lambda j: j.simulation.terminal_cost, "error": lambda j: j.simulation.terminal_error,
+    "saturation": lambda j: j.simulation.saturation, "clearance": lambda j: j.simulation.clearance,
+    "first": lambda j: j.ms_first, "later": lambda j: j.ms_per_control}
 
 
 def payload(report: Results) -> dict[str, Any]:
@@ -41,7 +47,8 @@ def payload(report: Results) -> dict[str, Any]:
             "labels": [s.unit(name) for name in s.names], "horizon": report.ocp.horizon,
             "goal": [*report.ocp.x_goal.tolist(), *report.ocp.u_goal.tolist()],
             "lbu": s.lbu.tolist(), "ubu": s.ubu.tolist(), "explained": explained_method(report),
-            "B": len(report.x0), "x0": floats(report.x0), "gap": floats(report.gap),
+            "numbers": list(NUMBERS),
+            "channels": channels(report), "B": len(report.x0), "x0": floats(report.x0), "gap": floats(report.gap),
             "feasible": report.feasible.astype(int).tolist(),
             "best": [_index(report, i) for i in range(len(report.x0))],
             "methods": [_method(report, j, nodes, states) for j in report.judged],
@@ -56,8 +63,8 @@ def floats(values: ArrayLike) -> str:
 
 def kept_states(report: Results) -> tuple[int, NDArray[np.integer[Any]]]:
     """(nodes, states) whose runs fit into the page: all states if they can, else the worst and an even choice."""
-    channels = _channels(report)
-    size = len(report.judged) * channels * 2 * 4 / 3  # characters of one state at one node
+    width = len(report.ocp.system.names) + len(channels(report))
+    size = len(report.judged) * width * 2 * 4 / 3  # characters of one state at one node
     for nodes, budget in NODES.items():
         if len(report.x0) * (nodes + 4) * size <= budget:
             return nodes, np.arange(len(report.x0))
@@ -67,9 +74,10 @@ def kept_states(report: Results) -> tuple[int, NDArray[np.integer[Any]]]:
     return nodes, np.unique(np.r_[order[: n // 4], order[even]])
 
 
-def _channels(report: Results) -> int:
-    """States, controls, cost to go, and V along the run where a method has one."""
-    return report.ocp.system.nx + report.ocp.system.nu + 1 + (valued(report) is not None)
+def channels(report: Results) -> dict[str, int]:
+    """Where in a run stands what follows its states and controls: the cost to go, and V where a method has one."""
+    after = len(report.ocp.system.names)
+    return {"togo": after} | ({} if valued(report) is None else {"V": after + 1})
 
 
 def valued(report: Results) -> Judged | None:
@@ -86,14 +94,13 @@ def _index(report: Results, i: int) -> int:
 def _method(report: Results, j: Judged, nodes: int, states: NDArray[np.integer[Any]]) -> dict[str, Any]:
     s = j.simulation
     index = np.unique(np.rint(np.linspace(0, len(s.t) - 1, min(nodes, len(s.t)))).astype(int))
-    channels = [s.x[states], s.u[states], cost_to_go(report.ocp, j)[states, :, None]]
-    run = np.concatenate([c[:, index] for c in channels], axis=2)
+    parts = [s.x[states], s.u[states], cost_to_go(report.ocp, j)[states, :, None]]  # in the order of `channels`
+    run = np.concatenate([part[:, index] for part in parts], axis=2)
     if (owner := valued(report)) is not None:
         run = np.concatenate([run, values_along(owner, s.t[index], s.x[states][:, index])[..., None]], axis=2)
-    numbers = np.stack([s.cost, s.running_cost, s.terminal_cost, s.terminal_error, s.saturation, s.clearance,
-                        j.ms_first, j.ms_per_control], axis=1)
+    numbers = np.stack([read(j) for read in NUMBERS.values()], axis=1)
     failed = {str(i): str(s.message[i]) for i in np.flatnonzero(~np.asarray(s.success, dtype=bool))}
-    return {"name": j.name, "how": j.how, "held": "held" in j.how, "t": s.t[index].tolist(), "failed": failed,
+    return {"name": j.name, "how": j.how, "held": j.held, "t": s.t[index].tolist(), "failed": failed,
             "numbers": floats(numbers), **quantised(run)}
 
 
@@ -113,8 +120,8 @@ def quantised(run: Array) -> dict[str, str]:
 
 def cost_to_go(ocp: OCP, j: Judged) -> Array:
     """[B, K+1], what a run still costs at its nodes: L by trapezoids, scaled so that it starts at the judged cost."""
-    s, held = j.simulation, "held" in j.how
-    end = s.u[:, :-1] if held else s.u[:, 1:]
+    s = j.simulation
+    end = s.u[:, :-1] if j.held else s.u[:, 1:]
     steps = 0.5 * np.diff(s.t) * (_running(ocp, s.x[:, :-1], s.u[:, :-1]) + _running(ocp, s.x[:, 1:], end))
     total = steps.sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):

@@ -29,7 +29,6 @@ from nocl.support.checks import Array
 
 REFERENCE = "reference"  # the name of a yardstick among the methods: its speed is no method's
 VIOLATION = 1e-3  # a path constraint below minus this, in its own unit, is violated
-OPEN_LOOP = "open loop"  # how a plan's control was run
 WIDTH = 118  # characters of a line in the terminal
 Mask = NDArray[np.bool_]
 
@@ -47,7 +46,7 @@ class Judged:
     """One method on all B initial states, as the judge saw it."""
 
     name: str
-    how: str  # how its control was run
+    how: str  # how its control was run, in words
     simulation: Simulation
     ms_first: Array  # [B], milliseconds to the first control: a solve, or one evaluation of a controller
     ms_per_control: Array  # [B], milliseconds for each later control; NaN in open loop, where none is computed
@@ -56,6 +55,7 @@ class Judged:
     predicted: Array  # [B], the cost that the method itself expected, NaN where it has no opinion
     plan: Plan | None = None  # what a solver planned
     value: Callable[[Array, float], Array] | None = None  # (x [B, nx], t) -> V [B], where it has one
+    held: bool = False  # whether each control is held to the next node; else it is continuous
 
     @property
     def feasible(self) -> Mask:

@@ -9,7 +9,6 @@ import numpy as np
 
 from nocl.comparisons.report.results import (
     COST_FLOOR,
-    OPEN_LOOP,
     REFERENCE,
     Judged,
     Results,
@@ -47,7 +46,7 @@ def _without_feedback(judged: Judged) -> list[str]:
     known = np.asarray(judged.simulation.success, dtype=bool) & np.isfinite(judged.predicted)
     cost, predicted = judged.simulation.cost[known], judged.predicted[known]
     excess = (cost - predicted) / np.maximum(np.abs(predicted), COST_FLOOR)
-    if not judged.how.startswith(OPEN_LOOP) or not known.any() or np.median(excess) <= UNSTABLE:
+    if judged.plan is None or not known.any() or np.median(excess) <= UNSTABLE:
         return []
     return [f"{judged.name}'s plans predict a cost of {number(mean(predicted))} on average; run open loop on the "
             f"exact f they cost {number(mean(cost))}: what is missing there is feedback, or a finer grid or model, "

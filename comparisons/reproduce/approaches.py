@@ -1,35 +1,36 @@
 """The paper's "which approach gives what", as measured facts: what each takes as the number of states grows.
 
 Level sets give V over a whole box, from a grid; NMPC an answer for one state at a time; CND a network for all initial
-states. A cell is one problem and one way, kept as a file of its own once it is finished.
+states.
 """
 
 from __future__ import annotations
 
-import csv
-import importlib.util
-import io
 import time
 import warnings
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
-from tqdm import tqdm
 
-from nocl.comparisons.reproduce.cells import read_cell
+from nocl.comparisons.reproduce import table
 from nocl.comparisons.reproduce.dubins import rollout_ms
+from nocl.comparisons.reproduce.table import Place, grid
 from nocl.ocp import OCP
-from nocl.support import store
+from nocl.solvers.cnd.controller import pretrained
+from nocl.solvers.ddp.global_search import solve_globally
+from nocl.solvers.ddp.solver import DDP
+from nocl.solvers.nmpc.solver import NMPC
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
 from nocl.systems import load_ocp
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 PROBLEMS = ("double_integrator", "pendulum", "dubins", "cartpole", "acrobot", "quadrotor")
-WAYS = {"level-sets": "HJB level sets", "nmpc": "NMPC", "cnd": "CND"}
-CELLS = "cells"
 UNLIMITED = 1e12
 REFERENCE = 320  # intervals of DDP's optimum
 # of the paper's table of approaches: HJB-LSM, NMPC, CT-MBRL; None where it has a dash
@@ -37,23 +38,12 @@ CLAIMS = {"solution over the entire state space": (True, False, True), "no space
           "no requirement of true dynamics": (False, False, True), "sample efficiency": (None, True, False)}
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What to run."""
+@dataclass(frozen=True, kw_only=True)
+class Plan(table.Plan):
+    """Each way on each problem."""
 
     nodes: int = 31  # of a grid, along each axis
     states: int = 10  # initial states that NMPC solves
-    problems: tuple[str, ...] = PROBLEMS
-
-    def __post_init__(self) -> None:
-        for name in ("nodes", "states"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 8:
-                raise ValueError(f"reproduce approaches: {name} is {value!r}; expected an integer >= 8")
-        unknown = [p for p in self.problems if p not in PROBLEMS]
-        if unknown or not self.problems:
-            raise ValueError(f"reproduce approaches: problems are {list(self.problems)}; expected some of "
-                             f"{', '.join(PROBLEMS)}")
 
 
 @dataclass(frozen=True)
@@ -72,30 +62,9 @@ class Cell:
     note: str
     key: dict[str, Any]
 
-
-def run(out: str | Path, plan: Plan | None = None, *, progress: bool = True) -> list[Cell]:
-    """The cells of a plan, those that are finished in folder `out` taken from there."""
-    folder, plan, cells = Path(out), plan or Plan(), []
-    pairs = [(problem, way) for problem in plan.problems for way in WAYS]
-    with tqdm(pairs, "approaches", disable=not progress, unit="cell") as bar:
-        for problem, way in bar:
-            if way == "level-sets" and importlib.util.find_spec("hj_reachability") is None:
-                bar.write("level sets are left out: hj-reachability is not installed")
-                continue
-            bar.set_postfix_str(f"{problem}, {WAYS[way]}")
-            path = folder / CELLS / f"approaches-{problem}-{way}.json"
-            cell = _read(path) if path.is_file() else None
-            if cell is None or cell.key != _key(way, plan, problem):
-                cell = MAKERS[way](problem, plan)
-                store.write_json(path, asdict(cell))
-            cells.append(cell)
-    return cells
-
-
-def finished(out: str | Path) -> list[Cell]:
-    """All cells that the folder holds, by rising numbers of states."""
-    cells = [_read(path) for path in sorted((Path(out) / CELLS).glob("approaches-*.json"))]
-    return sorted(cells, key=lambda c: (PROBLEMS.index(c.problem), list(WAYS).index(c.way)))
+    @property
+    def place(self) -> Place:
+        return Place(self.problem, self.way)
 
 
 def _key(way: str, plan: Plan, problem: str) -> dict[str, Any]:
@@ -106,13 +75,9 @@ def _key(way: str, plan: Plan, problem: str) -> dict[str, Any]:
     return key
 
 
-def _read(path: Path) -> Cell:
-    return read_cell(path, Cell, "the table of approaches", ("memory", "before", "ms", "error"))
-
-
 def _level_sets(problem: str, plan: Plan) -> Cell:
     """Solved up to 3 states; of 4 predicted by the compiled solver and a timed step; beyond, the nodes are counted."""
-    from nocl.solvers.levelset.solver import LevelSet
+    from nocl.solvers.levelset.solver import LevelSet  # JAX
 
     ocp, nan = load_ocp(problem), float("nan")
     nx, covers, key = ocp.system.nx, "V(x, t) on the whole box", _key("level-sets", plan, problem)
@@ -133,8 +98,6 @@ def _level_sets(problem: str, plan: Plan) -> Cell:
 
 
 def _nmpc(problem: str, plan: Plan) -> Cell:
-    from nocl.solvers.nmpc.solver import NMPC
-
     ocp = load_ocp(problem)
     start = time.perf_counter()
     solver = NMPC(ocp, starts=1, passes=0)
@@ -163,9 +126,6 @@ def _cnd(problem: str, plan: Plan) -> Cell:
 
 def _error(ocp: OCP, x0: Array, V: Any) -> float:
     """Mean |V - J| / J over the states; where V has no answer, the states are left out."""
-    from nocl.solvers.ddp.global_search import solve_globally
-    from nocl.solvers.ddp.solver import DDP
-
     best = solve_globally(DDP(ocp, intervals=REFERENCE), x0, seed=0).best
     wrong = np.abs(np.asarray(V).ravel() - best.cost) / best.cost
     return float(np.mean(wrong[best.success & np.isfinite(wrong)]))
@@ -173,8 +133,6 @@ def _error(ocp: OCP, x0: Array, V: Any) -> float:
 
 def _shipped(problem: str) -> Any:
     """The controller that comes with nocl, or None."""
-    from nocl.solvers.cnd.controller import pretrained
-
     try:
         return pretrained(problem, "exact")
     except ValueError:
@@ -186,70 +144,84 @@ def _training_seconds(cnd: Any) -> float:
     return float(sum(seconds.values())) if isinstance(seconds, dict) else float(seconds)
 
 
-MAKERS = {"level-sets": _level_sets, "nmpc": _nmpc, "cnd": _cnd}
+@dataclass(frozen=True)
+class Way:
+    """A way to solve a problem."""
+
+    title: str
+    make: Callable[[str, Plan], Cell]
 
 
-def write(folder: str | Path, cells: Sequence[Cell]) -> list[Path]:
-    """approaches.md, .tex, .csv and .png in the folder; their paths."""
-    texts = {"md": markdown(cells), "tex": latex(cells), "csv": as_csv(cells)}
-    paths = [store.write_text(Path(folder) / f"approaches.{kind}", text) for kind, text in texts.items()]
-    return [*paths, store.write_bytes(Path(folder) / "approaches.png", figure(cells))]
+WAYS = {"level-sets": Way("HJB level sets", _level_sets), "nmpc": Way("NMPC", _nmpc), "cnd": Way("CND", _cnd)}
 
 
-def figure(cells: Sequence[Cell]) -> bytes:
-    """Memory, seconds before, milliseconds a state and mean error against the number of states, as PNG."""
-    import matplotlib
-    from matplotlib.figure import Figure
+class Approaches(table.Table[Plan, Cell, Cell]):
+    """A row for each cell, by rising numbers of states."""
 
-    from nocl.comparisons.report.style import COLOURS, STYLE, encode
+    name, title, known = "approaches", "approaches", "the table of approaches"
+    file = "approaches-{problem}-{way}"
+    problems, ways, plan_type, cell_type = PROBLEMS, WAYS, Plan, Cell
+    numbers = ("memory", "before", "ms", "error")
+    quick: ClassVar[dict[str, int]] = {"nodes": 15}
+    least: ClassVar[dict[str, int]] = {"nodes": 8, "states": 8}
+    methods: ClassVar[dict[str, str]] = {"level-sets": "level-sets"}
 
-    quantities = {"memory": "memory, MB", "before": "s before", "ms": "ms a state", "error": "mean error of V"}
-    with matplotlib.rc_context(STYLE):
-        drawing = Figure(figsize=(12, 3), layout="constrained")
-        panels = drawing.subplots(1, len(quantities))
-        for axes, (name, title) in zip(panels, quantities.items(), strict=True):
-            for colour, (way, label) in zip(COLOURS, WAYS.items(), strict=False):
-                own = [c for c in cells if c.way == way]
-                axes.plot([c.nx for c in own], [getattr(c, name) for c in own], "o", color=colour, label=label)
-            axes.set(yscale="log", xlabel="states", title=title)
-        panels[0].legend(fontsize=7)
-        return bytes(encode(drawing, "png"))
+    def key(self, plan: Plan, place: Place) -> dict[str, Any]:
+        return _key(place.way, plan, place.problem)
+
+    def make(self, plan: Plan, place: Place, folder: Path) -> Cell:
+        return WAYS[place.way].make(place.problem, plan)
+
+    def entries(self, cells: Sequence[Cell]) -> list[Cell]:
+        return list(cells)
+
+    def columns(self) -> list[table.Column[Cell]]:
+        return [("problem", lambda c: c.problem), ("states", lambda c: str(c.nx)),
+                ("way", lambda c: WAYS[c.way].title), ("size", lambda c: c.size),
+                ("memory, MB", lambda c: _number(c.memory)), ("s before", lambda c: _number(c.before)),
+                ("ms a state", lambda c: _number(c.ms)),
+                ("mean error", lambda c: f"{100 * c.error:.2g} %" if np.isfinite(c.error) else "-"),
+                ("covers", lambda c: c.covers), ("note", lambda c: c.note)]
+
+    def markdown(self, entries: Sequence[Cell]) -> str:
+        """What was measured, and what the paper says."""
+        marks = {True: "yes", False: "no", None: "-"}
+        claims = [[claim, *(marks[m] for m in said)] for claim, said in CLAIMS.items()]
+        return super().markdown(entries) + "\nWhat the paper says of them:\n\n" + table.lines(
+            ["", "HJB-LSM", "NMPC", "CT-MBRL"], claims)
+
+    def row(self, entry: Cell) -> dict[str, Any]:
+        return {name: value for name, value in asdict(entry).items() if name != "key"}
+
+    def latex(self, entries: Sequence[Cell]) -> str:
+        """The measured part."""
+        head = [r"problem & states & way & memory (MB) & s before & ms a state & error (\%) \\"]
+        return grid("l r l r r r r", head, [
+            ([c.problem.replace("_", " "), str(c.nx), WAYS[c.way].title, _number(c.memory), _number(c.before),
+              _number(c.ms), _number(100 * c.error)], []) for c in entries])
+
+    def figures(self, entries: Sequence[Cell], cells: Sequence[Cell]) -> dict[str, Figure]:
+        """Memory, seconds before, milliseconds a state and mean error against the number of states."""
+        import matplotlib
+        from matplotlib.figure import Figure
+
+        from nocl.comparisons.report.style import COLOURS, STYLE
+
+        quantities = {"memory": "memory, MB", "before": "s before", "ms": "ms a state", "error": "mean error of V"}
+        with matplotlib.rc_context(STYLE):
+            drawing = Figure(figsize=(12, 3), layout="constrained")
+            panels = drawing.subplots(1, len(quantities))
+            for axes, (name, title) in zip(panels, quantities.items(), strict=True):
+                for colour, (key, way) in zip(COLOURS, WAYS.items(), strict=False):
+                    own = [c for c in cells if c.way == key]
+                    axes.plot([c.nx for c in own], [getattr(c, name) for c in own], "o", color=colour, label=way.title)
+                axes.set(yscale="log", xlabel="states", title=title)
+            panels[0].legend(fontsize=7)
+        return {"": drawing}
 
 
 def _number(x: float) -> str:
     return f"{x:.3g}" if np.isfinite(x) else "-"
 
 
-def _percent(x: float) -> str:
-    return f"{100 * x:.2g} %" if np.isfinite(x) else "-"
-
-
-def markdown(cells: Sequence[Cell]) -> str:
-    """A row for each problem and way, by rising numbers of states."""
-    lines = ["| problem | states | way | size | memory, MB | s before | ms a state | mean error | covers | note |",
-             f"|{'---|' * 10}"]
-    lines += [f"| {c.problem} | {c.nx} | {WAYS[c.way]} | {c.size} | {_number(c.memory)} | {_number(c.before)} | "
-              f"{_number(c.ms)} | {_percent(c.error)} | {c.covers} | {c.note} |" for c in cells]
-    marks = {True: "yes", False: "no", None: "-"}
-    lines += ["", "What the paper says of them:", "", "| | HJB-LSM | NMPC | CT-MBRL |", f"|{'---|' * 4}"]
-    lines += [f"| {claim} | {' | '.join(marks[m] for m in said)} |" for claim, said in CLAIMS.items()]
-    return "\n".join(lines) + "\n"
-
-
-def latex(cells: Sequence[Cell]) -> str:
-    """The measured part."""
-    lines = [r"\begin{tabular}{l r l r r r r}", r"\toprule",
-             r"problem & states & way & memory (MB) & s before & ms a state & error (\%) \\", r"\midrule"]
-    lines += [f"{c.problem.replace('_', ' ')} & {c.nx} & {WAYS[c.way]} & {_number(c.memory)} & {_number(c.before)} & "
-              rf"{_number(c.ms)} & {_number(100 * c.error)} \\" for c in cells]
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", ""])
-
-
-def as_csv(cells: Sequence[Cell]) -> str:
-    """All of it."""
-    file = io.StringIO()
-    names = [f.name for f in fields(Cell) if f.name != "key"]
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(names)
-    writer.writerows([getattr(c, name) for name in names] for c in cells)
-    return file.getvalue()
+TABLE = Approaches()

@@ -1,32 +1,40 @@
 """The paper's Dubins experiment: RRT* against CND round an obstacle, here with NMPC, level sets and the optimum too.
 
-A cell is one way and one seed (of the initial states, and of what is random in the way); it is kept as a file of its
-own once it is finished. All trajectories are judged on the exact f by nocl.simulate. A run succeeds where it ends
-within TOLERANCE of the goal (m and rad, angles modulo 2 pi) and holds the obstacle.
+A cell is one way with one seed, of the initial states and of what is random in the way. All trajectories are judged on
+the exact f by nocl.simulate. A run succeeds where it ends within TOLERANCE of the goal (m and rad, angles modulo 2 pi)
+and holds the obstacle.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from nocl.comparisons.report.results import VIOLATION
-from nocl.comparisons.reproduce.cells import read_cell
+from nocl.comparisons.reproduce import table
+from nocl.comparisons.reproduce.table import Place, grid, small
 from nocl.judge import Simulation, simulate
 from nocl.ocp import OCP
-from nocl.support import store
+from nocl.solvers.cnd.controller import pretrained
+from nocl.solvers.cnd.paper import PaperSettings
+from nocl.solvers.cnd.training import train
+from nocl.solvers.ddp.global_search import solve_globally
+from nocl.solvers.ddp.solver import DDP
+from nocl.solvers.nmpc.solver import NMPC
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
+from nocl.support.threads import one_thread
 from nocl.systems import load_ocp
 from nocl.translate.rk4 import rk4
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 TOLERANCE = 0.1
 INTERVALS = 80
@@ -38,33 +46,17 @@ PENALTY_SLOPE = 0.1  # of the obstacle's penalty there, a second and m; at 0.06 
 MARGIN = 0.05  # m, by which the obstacle is wider there: half a cell, so that interpolated gradients hold it
 # of the paper's method: at the rate of 0.01 it ends 0.6 from the goal; held controls are several times as fast to train
 PAPER: dict[str, Any] = {"learning_rate": 3e-3, "batch": 128, "hold": True}
-CELLS = "cells"
+COLUMNS = 4  # panels in a row of the figure
 Made = tuple[Any, float, str]  # (controller or controls, ms a state, how it was made)
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What to run."""
+@dataclass(frozen=True, kw_only=True)
+class Plan(table.Plan):
+    """Each way on the n initial states of each seed."""
 
     n: int = 1000
-    seeds: int = 1
-    grid: tuple[int, ...] = (41, 81, 81)
-    paper_iterations: int = 1000  # of Adam, of the paper's method
-    quick: bool = False
-    ways: tuple[str, ...] = ()  # default: all
-
-    def __post_init__(self) -> None:
-        for name in ("n", "seeds", "paper_iterations"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"reproduce dubins: {name} is {value!r}; expected an integer >= 1")
-        unknown = [way for way in self.ways if way not in WAYS]
-        if unknown:
-            raise ValueError(f"reproduce dubins: ways are {list(self.ways)}; expected some of {', '.join(WAYS)}")
-
-    def cells(self) -> list[tuple[str, int]]:
-        """(way, seed) of every cell."""
-        return [(way, seed) for seed in range(self.seeds) for way in self.ways or WAYS]
+    grid: tuple[int, ...] = (41, 81, 81)  # of the level sets
+    iterations: int = 1000  # of Adam, of the paper's method
 
 
 @dataclass(frozen=True)
@@ -83,46 +75,12 @@ class Cell:
     paths: list[list[list[float]]] = field(repr=False)  # [DRAWN, nodes, 2], of the first states
 
     @property
+    def place(self) -> Place:
+        return Place("dubins", self.way, self.seed)
+
+    @property
     def success(self) -> Array:
         return (np.asarray(self.error) <= TOLERANCE) & (np.asarray(self.clearance) >= -VIOLATION)
-
-
-def run(out: str | Path, plan: Plan | None = None, *, progress: bool = True) -> list[Cell]:
-    """The cells of a plan, those that are finished in folder `out` taken from there; a way without its extra is left
-    out, and says so on the bar."""
-    folder, plan, cells = Path(out), plan or Plan(), []
-    with tqdm(plan.cells(), "Dubins", disable=not progress, unit="cell", smoothing=0.05) as bar:
-        for way, seed in bar:
-            if (missing := NEEDS.get(way)) and importlib.util.find_spec(missing) is None:
-                bar.write(f"{WAYS[way].title} is left out: {missing} is not installed")
-                continue
-            bar.set_postfix_str(f"{WAYS[way].title}, seed {seed}")
-            path = folder / CELLS / f"dubins-{way}-{seed}.json"
-            cell = _read(path) if path.is_file() else None
-            if cell is None or cell.key != _key(way, plan):
-                cell = make(way, seed, plan, folder)
-                store.write_json(path, asdict(cell))
-            cells.append(cell)
-    return cells
-
-
-def finished(out: str | Path) -> list[Cell]:
-    """All cells that the folder holds, seed by seed in the order of WAYS."""
-    cells = [_read(path) for path in sorted((Path(out) / CELLS).glob("dubins-*.json"))]
-    return sorted(cells, key=lambda c: (c.seed, list(WAYS).index(c.way)))
-
-
-def make(way: str, seed: int, plan: Plan, folder: Path) -> Cell:
-    """One cell, from nothing."""
-    ocp = load_ocp("dubins")
-    x0 = ocp.initial_states.sample(plan.n, 1 + seed)
-    controller, ms, made = WAYS[way].make(ocp, x0, seed, plan, folder)
-    s, length = judged(ocp, controller, x0)
-    turned = s.x[:, -1] - ocp.x_goal
-    turned[:, 2] = (turned[:, 2] + math.pi) % (2 * math.pi) - math.pi
-    error = np.where(s.success, np.linalg.norm(turned, axis=1), np.inf)
-    return Cell(way, seed, _key(way, plan), ms, made, length.tolist(), error.tolist(), s.clearance.tolist(),
-                s.cost.tolist(), np.round(s.x[:DRAWN, :, :2], 3).tolist())
 
 
 def judged(ocp: OCP, controller: Any, x0: Array) -> tuple[Simulation, Array]:
@@ -145,8 +103,6 @@ def rollout_ms(ocp: OCP, controller: Callable[[Array, float], Array], x0: Array)
 
     A state to which the controller has no answer stays where it is: only the time counts here.
     """
-    from nocl.support.threads import one_thread
-
     x, h, f = x0, ocp.horizon / INTERVALS, ocp.functions.f
     with one_thread():
         controller(x, 0.0)
@@ -160,7 +116,7 @@ def rollout_ms(ocp: OCP, controller: Callable[[Array, float], Array], x0: Array)
 
 def _rrt(iterations: int) -> Callable[..., Made]:
     def made(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
-        from nocl.solvers.rrt_star import RRTStar
+        from nocl.solvers.rrt_star import RRTStar  # OMPL
 
         planner = RRTStar(ocp, iterations=iterations, seed=seed)
         solution = planner.solve(x0)
@@ -171,8 +127,6 @@ def _rrt(iterations: int) -> Callable[..., Made]:
 
 
 def _nmpc(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
-    from nocl.solvers.nmpc.solver import NMPC
-
     solver = NMPC(ocp, INTERVALS, seed=seed)
     solution = solver.solve(x0, progress=False)
     u = np.where(np.asarray(solution.success)[:, None, None], solution.u, np.nan)
@@ -180,9 +134,6 @@ def _nmpc(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
 
 
 def _optimum(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
-    from nocl.solvers.ddp.global_search import solve_globally
-    from nocl.solvers.ddp.solver import DDP
-
     ddp, start = DDP(ocp, intervals=INTERVALS), time.perf_counter()
     best = solve_globally(ddp, x0, seed=seed).best
     u = np.where(best.success[:, None, None], best.u, np.nan)
@@ -190,9 +141,9 @@ def _optimum(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
 
 
 def _level_sets(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
-    from nocl.solvers.levelset.solver import LevelSet, LevelSetSolution
+    from nocl.solvers.levelset.solver import LevelSet, LevelSetSolution  # JAX
 
-    path = folder / CELLS / "dubins-V.safetensors"
+    path = folder / table.CELLS / "dubins-V.safetensors"
     wide = replace(ocp, penalty_margin=MARGIN)
     problem = LevelSet(wide, plan.grid, box=BOX, stretch=STRETCH, penalty_slope=PENALTY_SLOPE, scheme="weno5",
                        max_seconds=3600.0)
@@ -208,8 +159,6 @@ def _level_sets(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Mad
 
 def _pretrained(way: str) -> Callable[..., Made]:
     def made(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
-        from nocl.solvers.cnd.controller import pretrained
-
         cnd = pretrained("dubins", SHIPPED[way])
         return cnd, rollout_ms(ocp, cnd, x0), "as it ships with nocl"
 
@@ -217,55 +166,41 @@ def _pretrained(way: str) -> Callable[..., Made]:
 
 
 def _paper(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
-    from nocl.solvers.cnd.paper import PaperSettings
-    from nocl.solvers.cnd.training import train
-
     start = time.perf_counter()
-    settings = PaperSettings(iterations=plan.paper_iterations, **PAPER)
+    settings = PaperSettings(iterations=plan.iterations, **PAPER)
     cnd = train(ocp, method="paper", seed=seed, settings=settings, progress=False)
     text = f"u(x), {settings.iterations} iterations of {settings.batch} rollouts, Adam from {settings.learning_rate:g}"
     text += f", {time.perf_counter() - start:.0f} s"
     return cnd, rollout_ms(ocp, cnd, x0), text
 
 
+class Published(NamedTuple):
+    """The paper's numbers."""
+
+    length: float
+    length_std: float
+    seconds: float
+    success: float
+
+
 @dataclass(frozen=True)
 class Way:
-    """A row of the table; `paper`: mean length, its s.d., seconds, success rate;
-    `costed`: whether costs compare (RRT* turns round as often as it likes, and G counts that)."""
+    """A row; `costed`: whether costs compare (RRT* turns round as often as it likes, and G counts that)."""
 
     title: str
     make: Callable[..., Made]
-    paper: tuple[float, float, float, float] | None = None
+    paper: Published | None = None
     costed: bool = True
 
 
-WAYS = {"rrt-100": Way("RRT* (iter: 100)", _rrt(100), (4.8871, 0.9607, 6.9313, 0.889), costed=False),
-        "rrt-200": Way("RRT* (iter: 200)", _rrt(200), (4.7343, 0.8451, 26.0595, 0.939), costed=False),
+WAYS = {"rrt-100": Way("RRT* (iter: 100)", _rrt(100), Published(4.8871, 0.9607, 6.9313, 0.889), costed=False),
+        "rrt-200": Way("RRT* (iter: 200)", _rrt(200), Published(4.7343, 0.8451, 26.0595, 0.939), costed=False),
         "nmpc": Way("NMPC", _nmpc), "level-sets": Way("HJB level sets", _level_sets),
-        "cnd-paper": Way("CND, the paper's method", _paper, (4.1076, 0.6916, 0.0634, 0.999)),
+        "cnd-paper": Way("CND, the paper's method", _paper, Published(4.1076, 0.6916, 0.0634, 0.999)),
         "cnd": Way("CND, nocl's default, exact f", _pretrained("cnd")),
         "cnd-learned": Way("CND, nocl's default, learned f", _pretrained("cnd-learned")),
         "optimum": Way("multi-start optimum", _optimum)}
 SHIPPED = {"cnd": "exact", "cnd-learned": "learned"}  # way -> dynamics
-NEEDS = {"rrt-100": "ompl", "rrt-200": "ompl", "level-sets": "hj_reachability"}
-PLANS = {False: Plan(), True: Plan(n=20, grid=(24, 37, 41), paper_iterations=20, quick=True)}
-
-
-def _key(way: str, plan: Plan) -> dict[str, Any]:
-    key: dict[str, Any] = {"n": plan.n}
-    if way == "level-sets":
-        key |= {"grid": list(plan.grid), "stretch": list(STRETCH), "penalty_slope": PENALTY_SLOPE, "margin": MARGIN}
-    if way == "cnd-paper":
-        key |= {"iterations": plan.paper_iterations, **PAPER}
-    if way in SHIPPED:
-        from nocl.solvers.cnd.controller import pretrained
-
-        key["controller"] = fingerprint(pretrained("dubins", SHIPPED[way]).to_casadi())
-    return key
-
-
-def _read(path: Path) -> Cell:
-    return read_cell(path, Cell, "the Dubins table", ("length", "error", "clearance", "cost", "paths"))
 
 
 @dataclass(frozen=True)
@@ -287,12 +222,6 @@ class Entry:
     made: str
 
 
-def table(cells: Sequence[Cell]) -> list[Entry]:
-    """One entry a way, in the order of WAYS."""
-    best = {cell.seed: cell for cell in cells if cell.way == "optimum"}
-    return [_entry([c for c in cells if c.way == way], best) for way in WAYS if any(c.way == way for c in cells)]
-
-
 def _entry(cells: Sequence[Cell], best: dict[int, Cell]) -> Entry:
     ok = np.concatenate([c.success for c in cells])
     length, cost, clear = (np.concatenate([getattr(c, name) for c in cells])
@@ -312,3 +241,105 @@ def _entry(cells: Sequence[Cell], best: dict[int, Cell]) -> Entry:
     ms = float(np.mean([c.ms for c in cells]))
     return Entry(cells[0].way, mean, std, float(ok.mean()), hits, ms, J, gap, gap95, ratio, len(cells[0].cost),
                  len(cells), cells[0].made)
+
+
+class Dubins(table.Table[Plan, Cell, Entry]):
+    """One problem, a row a way."""
+
+    name, title, known, file = "dubins", "Dubins", "the Dubins table", "dubins-{way}-{seed}"
+    problems, ways, plan_type, cell_type = ("dubins",), WAYS, Plan, Cell
+    numbers = ("length", "error", "clearance", "cost", "paths")
+    quick: ClassVar[dict[str, Any]] = {"n": 20, "grid": (24, 37, 41), "iterations": 20}
+    least: ClassVar[dict[str, int]] = {"n": 1, "seeds": 1, "iterations": 1}
+    methods: ClassVar[dict[str, str]] = {"rrt-100": "rrt-star", "rrt-200": "rrt-star", "level-sets": "level-sets"}
+
+    def key(self, plan: Plan, place: Place) -> dict[str, Any]:
+        way, key = place.way, dict[str, Any](n=plan.n)
+        if way == "level-sets":
+            key |= {"grid": list(plan.grid), "stretch": list(STRETCH), "penalty_slope": PENALTY_SLOPE, "margin": MARGIN}
+        if way == "cnd-paper":
+            key |= {"iterations": plan.iterations, **PAPER}
+        if way in SHIPPED:
+            key["controller"] = fingerprint(pretrained("dubins", SHIPPED[way]).to_casadi())
+        return key
+
+    def make(self, plan: Plan, place: Place, folder: Path) -> Cell:
+        ocp = load_ocp("dubins")
+        x0 = ocp.initial_states.sample(plan.n, 1 + place.seed)
+        controller, ms, made = WAYS[place.way].make(ocp, x0, place.seed, plan, folder)
+        s, length = judged(ocp, controller, x0)
+        turned = s.x[:, -1] - ocp.x_goal
+        turned[:, 2] = (turned[:, 2] + math.pi) % (2 * math.pi) - math.pi
+        error = np.where(s.success, np.linalg.norm(turned, axis=1), np.inf)
+        return Cell(place.way, place.seed, self.key(plan, place), ms, made, length.tolist(), error.tolist(),
+                    s.clearance.tolist(), s.cost.tolist(), np.round(s.x[:DRAWN, :, :2], 3).tolist())
+
+    def entries(self, cells: Sequence[Cell]) -> list[Entry]:
+        """One a way that has cells."""
+        best = {cell.seed: cell for cell in cells if cell.way == "optimum"}
+        return [_entry([c for c in cells if c.way == way], best) for way in WAYS if any(c.way == way for c in cells)]
+
+    def columns(self) -> list[table.Column[Entry]]:
+        def paper(e: Entry) -> str:
+            p = WAYS[e.way].paper
+            return "" if p is None else f"{p.length:.3f} ± {p.length_std:.3f}, {p.seconds:.3g}, {p.success:.3f}"
+
+        return [("way", lambda e: WAYS[e.way].title),
+                ("length, mean ± s.d.", lambda e: f"{e.length:.3f} ± {e.length_std:.3f}"),
+                ("success", lambda e: f"{e.success:.3f}"), ("collisions", lambda e: f"{e.collisions}"),
+                ("ms a state", lambda e: f"{e.ms:.3g}"), ("mean cost", lambda e: f"{e.cost:.4f}"),
+                ("gap: median, 95 %", lambda e: f"{e.gap:.2f}, {e.gap95:.2f} %" if math.isfinite(e.gap) else ""),
+                ("length / optimum's", lambda e: f"{e.ratio:.3f}" if math.isfinite(e.ratio) else ""),
+                ("states", lambda e: f"{e.n}" + (f" x {e.seeds}" if e.seeds > 1 else "")), ("made", lambda e: e.made),
+                ("paper: length, s, success", paper)]
+
+    def row(self, entry: Entry) -> dict[str, Any]:
+        paper = WAYS[entry.way].paper
+        return asdict(entry) | {f"paper_{name}": None if paper is None else getattr(paper, name)
+                                for name in Published._fields}
+
+    def latex(self, entries: Sequence[Entry]) -> str:
+        def cells(length: float, std: float, seconds: float, success: float) -> list[str]:
+            return [small(f"{length:.4f}", f"{std:.4f}"), f"{seconds:.4f}", f"{success:.3f}"]
+
+        head = [r"\textbf{Methods} & Trajectory len. & Compute time (s) & Success rate \\"]
+        body = [([WAYS[e.way].title.replace("RRT*", "RRT$^*$"), *cells(e.length, e.length_std, e.ms / 1e3, e.success)],
+                 [] if (paper := WAYS[e.way].paper) is None else cells(*paper)) for e in entries]
+        return grid("l | c c c", head, body)
+
+    def figures(self, entries: Sequence[Entry], cells: Sequence[Cell]) -> dict[str, Figure]:
+        """The first states' trajectories of each way, first seed; those that fail dashed."""
+        import matplotlib
+        from matplotlib.figure import Figure
+        from matplotlib.patches import Circle
+
+        from nocl.comparisons.report.style import COLOURS, STYLE
+
+        shown = [c for c in cells if c.seed == min(c.seed for c in cells)]
+        rows = math.ceil(len(shown) / COLUMNS)
+        with matplotlib.rc_context(STYLE):
+            drawing = Figure(figsize=(2.9 * COLUMNS, 2.9 * rows), layout="constrained")
+            panels = drawing.subplots(rows, COLUMNS, sharex=True, sharey=True, squeeze=False).ravel()
+            centre, radius = obstacle()
+            for cell, axes in zip(shown, panels, strict=False):
+                axes.add_patch(Circle(centre, radius, color="0.8"))
+                for path, ok in zip(cell.paths, cell.success, strict=False):
+                    axes.plot(*zip(*path, strict=True), "-" if ok else "--", color=COLOURS[0 if ok else 1], lw=0.9)
+                axes.plot(0, 0, "k+")
+                axes.set(title=WAYS[cell.way].title, aspect="equal")
+            for axes in panels[len(shown):]:
+                axes.set_axis_off()
+        return {"": drawing}
+
+
+def obstacle() -> tuple[tuple[float, float], float]:
+    """Centre and radius in m, read off the problem's own constraint."""
+    h = load_ocp("dubins").h
+    axis = np.linspace(-4, 4, 161)
+    x, y = np.meshgrid(axis, axis)
+    inside = h(np.array([x.ravel(), y.ravel(), 0 * x.ravel()])).full().ravel()
+    k = int(np.argmin(inside))
+    return (float(x.ravel()[k]), float(y.ravel()[k])), float(-inside[k])
+
+
+TABLE = Dubins()

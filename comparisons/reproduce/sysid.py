@@ -1,8 +1,7 @@
 """Table I of the paper: the error of f_theta by activation, with and without gradient supervision, on four systems.
 
-A cell is one system, one way of learning, one seed; it is kept as a file of its own once it is finished, so that an
-interrupted run goes on from there. Two more ways stand below the paper's six: nocl's plain network (`method="mlp"`:
-no structure, no sines and cosines of angles) and nocl's recipe.
+A cell is one network. Two more ways stand below the paper's six: nocl's plain network (`method="mlp"`: no structure, no
+sines and cosines of angles) and nocl's recipe.
 """
 
 from __future__ import annotations
@@ -10,25 +9,33 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
-from tqdm import tqdm
-
-from nocl.support import store
+from nocl.comparisons.reproduce import table
+from nocl.comparisons.reproduce.table import Place, grid, number, small, spread
 from nocl.sysid.identification import PaperSettings, Score, Settings, identify
-from nocl.system import System
 from nocl.systems import load_ocp
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 SYSTEMS = ("dubins", "acrobot", "cartpole", "quadrotor")
 HELD_OUT, HELD_OUT_SEED = 10_000, 1_000_003
 WIDTH = {"acrobot": 256}  # of the paper's networks, where those of ReLU need more than PaperSettings' default
 QUICK = Settings(iterations=150, polish=8, samples=20_000)
-CELLS = "cells"  # the folder of finished cells
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan(table.Plan):
+    """Each way on each system."""
+
+    seeds: int = 3
+    iterations: int = 50_000  # of Adam, in the paper's six ways
 
 
 @dataclass(frozen=True)
 class Way:
-    """One row of the table: a way of learning f_theta."""
+    """A way of learning f_theta."""
 
     name: str
     title: str
@@ -45,17 +52,27 @@ class Way:
         return QUICK if plan.quick else None
 
 
-WAYS = (Way("relu-values", "ReLU (without gradients)", "paper", False, "relu"),
-        Way("relu-gradients", "ReLU (with gradients)", "paper", True, "relu"),
-        Way("tanh-values", "tanh (without gradients)", "paper", False, "tanh"),
-        Way("tanh-gradients", "tanh (with gradients)", "paper", True, "tanh"),
-        Way("sine-values", "sine (without gradients)", "paper", False),
-        Way("sine-gradients", "sine (with gradients)", "paper", True),
-        Way("mlp-values", "nocl, plain network (without gradients)", "mlp", False),
-        Way("mlp-gradients", "nocl, plain network (with gradients)", "mlp", True),
-        Way("nocl", "nocl, structure first", "default", True))
+WAYS = {way.name: way for way in (
+    Way("relu-values", "ReLU (without gradients)", "paper", False, "relu"),
+    Way("relu-gradients", "ReLU (with gradients)", "paper", True, "relu"),
+    Way("tanh-values", "tanh (without gradients)", "paper", False, "tanh"),
+    Way("tanh-gradients", "tanh (with gradients)", "paper", True, "tanh"),
+    Way("sine-values", "sine (without gradients)", "paper", False),
+    Way("sine-gradients", "sine (with gradients)", "paper", True),
+    Way("mlp-values", "nocl, plain network (without gradients)", "mlp", False),
+    Way("mlp-gradients", "nocl, plain network (with gradients)", "mlp", True),
+    Way("nocl", "nocl, structure first", "default", True))}
 
-# mean, standard deviation, median, interquartile range: Table I of the paper, by WAYS[:6]
+class Published(NamedTuple):
+    """The paper's numbers of ||f_theta - f||."""
+
+    mean: float
+    std: float
+    median: float
+    iqr: float
+
+
+# mean, standard deviation, median, interquartile range: Table I of the paper, by the first six of WAYS
 PAPER: dict[str, tuple[tuple[float, float, float, float], ...]] = {
     "dubins": ((0.0071, 0.0033, 0.0067, 0.0043), (0.0134, 0.0090, 0.0113, 0.0094), (0.0017, 0.0009, 0.0016, 0.0009),
                (0.0015, 0.0003, 0.0015, 0.0005), (0.0014, 0.0008, 0.0013, 0.0008), (0.0008, 0.0003, 0.0008, 0.0004)),
@@ -68,30 +85,10 @@ PAPER: dict[str, tuple[tuple[float, float, float, float], ...]] = {
                   (1.3109, 0.9937, 1.0362, 0.9085), (15.6214, 8.1264, 15.8460, 13.2569))}
 
 
-@dataclass(frozen=True)
-class Plan:
-    """What to run: each way on each system with seeds 0, ..., seeds - 1."""
-
-    iterations: int = 50_000  # of Adam, in the paper's six ways
-    seeds: int = 3
-    systems: tuple[str, ...] = SYSTEMS
-    ways: tuple[str, ...] = tuple(w.name for w in WAYS)
-    quick: bool = False  # small budgets for nocl's own ways, and few samples for all
-
-    def __post_init__(self) -> None:
-        for name in ("iterations", "seeds"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise ValueError(f"reproduce sysid: {name} is {value!r}; expected an integer >= 1")
-        names = tuple(w.name for w in WAYS)
-        for what, given, known in (("systems", self.systems, SYSTEMS), ("ways", self.ways, names)):
-            if not given or not set(given) <= set(known):
-                raise ValueError(f"reproduce sysid: {what} are {list(given)}; expected some of {', '.join(known)}")
-
-    def cells(self) -> list[tuple[str, Way, int]]:
-        """(system, way, seed) of every cell: all of the first seed, then of the next."""
-        return [(system, way, seed) for seed in range(self.seeds) for system in self.systems
-                for way in WAYS if way.name in self.ways]
+def published(system: str, way: str) -> Published | None:
+    """The paper's numbers; None for ways that are not its own."""
+    names = list(WAYS)[: len(PAPER[system])]
+    return Published(*PAPER[system][names.index(way)]) if way in names else None
 
 
 @dataclass(frozen=True)
@@ -104,66 +101,23 @@ class Cell:
     score: Score
     seconds: float
     labels: int
-    settings: dict[str, Any]
+    settings: dict[str, Any]  # what it was made with; {}: as `identify` chooses
 
+    @property
+    def place(self) -> Place:
+        return Place(self.system, self.way, self.seed)
 
-def run(out: str | Path, plan: Plan | None = None, *, progress: bool = True) -> list[Cell]:
-    """The cells of a plan, those that are finished in folder `out` taken from there; made with other budgets, anew."""
-    folder, plan = Path(out), plan or Plan()
-    made = []
-    with tqdm(plan.cells(), "Table I", disable=not progress, unit="cell", smoothing=0.05) as bar:
-        for name, way, seed in bar:
-            bar.set_postfix_str(f"{name}, {way.title}, seed {seed}")
-            cell = _finished(folder, name, way, seed, plan)
-            if cell is None:
-                cell = _make(load_ocp(name).system, way, seed, plan)
-                store.write_json(_path(folder, name, way.name, seed), asdict(cell))
-            made.append(cell)
-    return made
-
-
-def _make(system: System, way: Way, seed: int, plan: Plan) -> Cell:
-    model = identify(system, method=way.method, gradients=way.gradients, seed=seed, progress=False,
-                     settings=way.settings(plan, system.name))
-    score = model.score(HELD_OUT, HELD_OUT_SEED + seed)  # samples that no network was trained on
-    return Cell(system.name, way.name, seed, score, model.card["seconds"], model.card["labels"],
-                _key(way, plan, system.name))
-
-
-def _key(way: Way, plan: Plan, system: str) -> dict[str, Any]:
-    settings = way.settings(plan, system)
-    return {} if settings is None else asdict(settings)
-
-
-def _path(folder: Path, system: str, way: str, seed: int) -> Path:
-    return folder / CELLS / f"{system}-{way}-{seed}.json"
-
-
-def _finished(folder: Path, system: str, way: Way, seed: int, plan: Plan) -> Cell | None:
-    path = _path(folder, system, way.name, seed)
-    if not path.is_file():
-        return None
-    cell = _read(path)
-    return cell if cell.settings == _key(way, plan, system) else None
-
-
-def _read(path: Path) -> Cell:
-    data = store.read_json(path)
-    try:
-        return Cell(**{**data, "score": Score(**data["score"])})
-    except (KeyError, TypeError) as error:
-        raise ValueError(f"{path} is no cell of Table I ({error}); delete it") from error
-
-
-def finished(folder: str | Path) -> list[Cell]:
-    """Every cell that a folder holds, whatever it was made with."""
-    return [_read(path) for path in sorted((Path(folder) / CELLS).glob("*.json"))]
+    @property
+    def key(self) -> dict[str, Any]:
+        return self.settings
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A cell of the printed table: over seeds, the means of what was measured, and the spread of the mean error."""
+    """A way on a system: over seeds, the means of what was measured, and the spread of the mean error."""
 
+    system: str
+    way: str
     mean: float
     std: float
     median: float
@@ -177,15 +131,15 @@ class Entry:
 
     @staticmethod
     def of(cells: Sequence[Cell]) -> Entry:
-        """The entry of one way on one system."""
+        """Of cells of one way on one system."""
         def over(values: Iterable[float]) -> float:
             numbers = list(values)
             return sum(numbers) / len(numbers)
 
-        means = [c.score.mean for c in cells]
-        return Entry(over(means), over(c.score.std for c in cells), over(c.score.median for c in cells),
-                     over(c.score.iqr for c in cells), min(means), max(means), over(c.score.jacobian for c in cells),
-                     over(c.seconds for c in cells), len(cells),
+        means, scores = [c.score.mean for c in cells], [c.score for c in cells]
+        return Entry(cells[0].system, cells[0].way, over(means), over(s.std for s in scores),
+                     over(s.median for s in scores), over(s.iqr for s in scores), min(means), max(means),
+                     over(s.jacobian for s in scores), over(c.seconds for c in cells), len(cells),
                      "; ".join(sorted({_made(c.settings) for c in cells})))
 
 
@@ -195,14 +149,6 @@ def _made(settings: Mapping[str, Any]) -> str:
     return steps + (f", {given['width']} wide" if given["width"] else "")
 
 
-def table(cells: Sequence[Cell]) -> dict[tuple[str, str], Entry]:
-    """(system, way) -> entry, for what there is; of cells with different budgets, those with the largest."""
-    groups: dict[tuple[str, str], list[Cell]] = {}
-    for cell in cells:
-        groups.setdefault((cell.system, cell.way), []).append(cell)
-    return {key: Entry.of(_dearest(group)) for key, group in groups.items()}
-
-
 def _dearest(cells: Sequence[Cell]) -> list[Cell]:
     """The cells made like the one with the most samples and iterations, and the widest network."""
     budgets = ("samples", "iterations", "width")
@@ -210,7 +156,89 @@ def _dearest(cells: Sequence[Cell]) -> list[Cell]:
     return [c for c in cells if c.settings == most]
 
 
-def published(system: str, way: str) -> Sequence[float] | None:
-    """(mean, standard deviation, median, interquartile range) of the paper; None for ways that are not its own."""
-    names = [w.name for w in WAYS[: len(PAPER[system])]]
-    return PAPER[system][names.index(way)] if way in names else None
+class TableOne(table.Table[Plan, Cell, Entry]):
+    """Ways down, systems across."""
+
+    name, title, known, file = "sysid", "Table I", "Table I", "{problem}-{way}-{seed}"
+    problems, ways, plan_type, cell_type = SYSTEMS, WAYS, Plan, Cell
+    quick: ClassVar[dict[str, int]] = {"seeds": 1, "iterations": 1000}
+    least: ClassVar[dict[str, int]] = {"seeds": 1, "iterations": 1}
+
+    def key(self, plan: Plan, place: Place) -> dict[str, Any]:
+        settings = WAYS[place.way].settings(plan, place.problem)
+        return {} if settings is None else asdict(settings)
+
+    def make(self, plan: Plan, place: Place, folder: Path) -> Cell:
+        way, system = WAYS[place.way], load_ocp(place.problem).system
+        model = identify(system, method=way.method, gradients=way.gradients, seed=place.seed, progress=False,
+                         settings=way.settings(plan, system.name))
+        score = model.score(HELD_OUT, HELD_OUT_SEED + place.seed)  # samples that no network was trained on
+        return Cell(place.problem, place.way, place.seed, score, model.card["seconds"], model.card["labels"],
+                    self.key(plan, place))
+
+    def from_data(self, data: dict[str, Any]) -> Cell:
+        return Cell(**{**data, "score": Score(**data["score"])})
+
+    def entries(self, cells: Sequence[Cell]) -> list[Entry]:
+        """One a system and way, for what there is; of cells with different budgets, those with the largest."""
+        groups = [[c for c in cells if (c.system, c.way) == (system, way)] for system in SYSTEMS for way in WAYS]
+        return [Entry.of(_dearest(group)) for group in groups if group]
+
+    def columns(self) -> list[table.Column[Entry]]:
+        def paper(e: Entry, text: str) -> str:
+            p = published(e.system, e.way)
+            return "" if p is None else {"mean": spread(p.mean, p.std), "median": _iqr(p),
+                                         "ratio": f"{e.mean / p.mean:.2f}"}[text]
+
+        return [("system", lambda e: e.system), ("network", lambda e: WAYS[e.way].title),
+                ("steps x batch, width; seconds", lambda e: f"{e.made}; {e.seconds:.0f}".lstrip("; ")),
+                ("mean ± s.d.", lambda e: spread(e.mean, e.std)), ("median (iqr)", _iqr),
+                ("mean of the seeds", lambda e: spread(e.lowest, e.highest, "{} .. {}")),
+                ("paper: mean ± s.d.", lambda e: paper(e, "mean")),
+                ("paper: median (iqr)", lambda e: paper(e, "median")),
+                ("ours / paper's", lambda e: paper(e, "ratio"))]
+
+    def row(self, entry: Entry) -> dict[str, Any]:
+        paper = published(entry.system, entry.way)
+        return asdict(entry) | {f"paper_{name}": None if paper is None else getattr(paper, name)
+                                for name in Published._fields}
+
+    def latex(self, entries: Sequence[Entry]) -> str:
+        found = {(e.system, e.way): e for e in entries}
+        systems = [s for s in SYSTEMS if any(e.system == s for e in entries)]
+        head = [" & " + " & ".join(rf"\multicolumn{{2}}{{c}}{{{s}}}" for s in systems) + r" \\",
+                " & " + " & ".join([r"mean (s.d.) & median (iqr)"] * len(systems)) + r" \\"]
+        body = []
+        for way in WAYS.values():
+            ours = [found.get((s, way.name)) for s in systems]
+            theirs = [published(s, way.name) for s in systems]
+            body.append(([way.title, *(text for e in ours for text in _pair(e, "--"))],
+                         [text for p in theirs for text in _pair(p, "")]))
+        return grid(f"l{'cc' * len(systems)}", head, body)
+
+    def figures(self, entries: Sequence[Entry], cells: Sequence[Cell]) -> dict[str, Figure]:
+        from nocl.comparisons.reproduce.dots import Dot, dots  # matplotlib
+
+        found = {(e.system, e.way): e for e in entries}
+
+        def dot(system: str, way: str) -> Dot:
+            e, paper = found.get((system, way)), published(system, way)
+            return Dot(None if e is None else (e.mean, e.lowest, e.highest), None if paper is None else paper.mean)
+
+        systems = [s for s in SYSTEMS if any(e.system == s for e in entries)]
+        return {"": dots({s: [dot(s, way) for way in WAYS] for s in systems}, [w.title for w in WAYS.values()],
+                         "mean error")}
+
+
+def _iqr(e: Entry | Published) -> str:
+    return f"{number(e.median)} ({number(e.iqr)})"
+
+
+def _pair(e: Entry | Published | None, blank: str) -> list[str]:
+    """Mean and median, in LaTeX."""
+    if e is None:
+        return [blank, blank]
+    return [small(number(e.mean), number(e.std)), small(number(e.median), number(e.iqr))]
+
+
+TABLE = TableOne()

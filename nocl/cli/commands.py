@@ -6,29 +6,21 @@ import argparse
 import os
 import sys
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NoReturn
+from typing import TYPE_CHECKING, Any
 
+from nocl.cli import arguments, reproduce
+from nocl.solvers import registry
 from nocl.support.fields import EFFORTS
 
 if TYPE_CHECKING:
     from nocl.ocp import OCP
 
-METHODS = ("CND", "NMPC", "LQR", "DDP", "NMPC-LOOP")
-SOLVERS = ("nmpc", "ddp", "lqr")
-FORMS = ("casadi", "l4casadi", "onnx", "c")
 QUICK_PROOF = ("casadi", "onnx", "c")  # of a run: L4CasADi takes half a minute to build
-MOST = 1_000_000  # of anything counted on the command line
-SEEDS = 2**62  # so that seeds made from one still fit in 64 bits
+SEED = ("of all that is drawn; the initial states that methods are run from are drawn with one more, "
+        "so that they are not those of training")
 INTERRUPTED = 130  # 128 + SIGINT, as shells have it
-
-
-class _Parser(argparse.ArgumentParser):
-    """argparse with one line for an error."""
-
-    def error(self, message: str) -> NoReturn:
-        raise ValueError(f"{message} (see {self.prog} --help)")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -65,9 +57,10 @@ def _one_line(error: Exception) -> str:
 
 def parser() -> argparse.ArgumentParser:
     """The commands and their options."""
-    top = _Parser(prog="nocl", description="Neural optimal control: one symbolic problem in, a checked controller out.",
-                  epilog="A problem is the name of one that comes with nocl (`nocl list`), or the path of a Python "
-                         "file that defines `ocp`. All output goes under --out, by default runs/NAME.")
+    top = arguments.Parser(
+        prog="nocl", description="Neural optimal control: one symbolic problem in, a checked controller out.",
+        epilog="A problem is the name of one that comes with nocl (`nocl list`), or the path of a Python file that "
+               "defines `ocp`. All output goes under --out, by default runs/NAME.")
     top.add_argument("--version", action="version", version=_version())
     commands = top.add_subparsers(title="commands", metavar="COMMAND", required=True)
 
@@ -88,225 +81,62 @@ def parser() -> argparse.ArgumentParser:
     _add(sub, "problem", "out", "seed", "exact", "effort", "quick")
     sub = command("solve", _solve, "solve the problem from many initial states")
     _add(sub, "problem", "out", "seed", "n", "intervals")
-    sub.add_argument("--solver", choices=SOLVERS, default="nmpc", help="default: nmpc")
-    sub.add_argument("--workers", type=_workers, default="auto", metavar="W",
-                     help="of NMPC's processes or DDP's threads, auto, or a Dask scheduler's tcp://...; default: auto")
+    sub.add_argument("--solver", choices=registry.solvers(), default="nmpc", metavar="NAME",
+                     help=f"default: nmpc; {_told_of(registry.solvers())}")
+    sub.add_argument("--workers", type=arguments.workers, default="auto", metavar="W",
+                     help="processes or threads of the solver, auto, or a Dask scheduler's tcp://...; default: auto")
     sub = command("export", _export, "write a run's controller, value function and dynamics, proven equal to it")
     _add(sub, "run")
-    sub.add_argument("--to", choices=FORMS, action="append", help="default: casadi and c; may be given several times")
-    sub.add_argument("--against", type=_forms, metavar="A,B", help="what is compared beside them; default: all of "
-                     f"{', '.join(FORMS)} that can be made here")
-    sub.add_argument("--out", type=_folder, metavar="DIR", help="default: RUN/export")
+    sub.add_argument("--to", choices=arguments.FORMS, action="append",
+                     help="default: casadi and c; may be given several times")
+    sub.add_argument("--against", type=arguments.forms, metavar="A,B",
+                     help=f"what is compared beside them; default: all of {', '.join(arguments.FORMS)} that can be "
+                          "made here")
+    sub.add_argument("--out", type=arguments.folder, metavar="DIR", help="default: RUN/export")
     sub = command("compare", _compare, "compare a run's controller with other methods, initial state by initial state")
     _add(sub, "run", "n", "intervals", "methods")
-    sub.add_argument("--seed", type=_seed, help="of the initial states; default: the seed of the run")
-    sub.add_argument("--hold", type=_holds, metavar="K", help="judge feedback once more, held on K intervals; or K,L")
+    sub.add_argument("--seed", type=arguments.seed, help=SEED + "; default: the seed of the run")
+    sub.add_argument("--hold", type=arguments.holds, metavar="K",
+                     help="judge feedback once more, held on K intervals; or K,L")
     sub.add_argument("--robust", action="store_true", help="also noise, kicks, late and held controls, wrong masses, "
                      "real time, and the region of initial states that works; takes minutes")
-    sub.add_argument("--out", type=_folder, metavar="DIR", help="default: RUN/report")
-    sub = command("reproduce", _nothing, "make a table of the paper again, its published numbers beside ours")
-    _add_tables(sub)
+    sub.add_argument("--out", type=arguments.folder, metavar="DIR", help="default: RUN/report")
+    sub = command("reproduce", lambda _: None, "make a table of the paper again, its published numbers beside ours")
+    reproduce.add_tables(sub)
     return top
 
 
-def _add_tables(sub: argparse.ArgumentParser) -> None:
-    """`nocl reproduce TABLE`: a subcommand each."""
-    tables = sub.add_subparsers(title="tables", metavar="TABLE", required=True)
-
-    def table(name: str, run: Callable[[argparse.Namespace], None], text: str) -> argparse.ArgumentParser:
-        def started(args: argparse.Namespace) -> None:
-            args.out = args.out or Path("runs") / f"reproduce-{name}{'-quick' if args.quick else ''}"
-            run(args)
-
-        one = tables.add_parser(name, help=text, description=text[0].upper() + text[1:] + ".")
-        one.set_defaults(command=started)
-        one.add_argument("--debug", action="store_true", help="show the traceback of an error")
-        one.add_argument("--out", type=_folder, metavar="DIR",
-                         help=f"default: runs/reproduce-{name}, with --quick {name}-quick; what is finished there with "
-                              "the same settings is not made again, what has others is replaced")
-        one.add_argument("--quick", action="store_true", help="small budgets: to see whether it works, not how well")
-        return one
-
-    one = table("sysid", _reproduce_sysid, "Table I: the error of learned dynamics by activation and supervision")
-    one.add_argument("--seeds", type=_count, metavar="K", help="networks a cell; default: 3, with --quick 1")
-    one.add_argument("--iterations", type=_count, metavar="N",
-                     help="of Adam in the paper's own ways; default: 50000, with --quick 1000")
-    one.add_argument("--systems", type=_words, metavar="A,B", help="default: all four")
-    one.add_argument("--ways", type=_words, metavar="A,B", help="rows, like sine-gradients,nocl; default: all nine")
-    one = table("dubins", _reproduce_dubins, "a car round an obstacle: RRT*, NMPC, level sets, CND, the optimum")
-    one.add_argument("--seeds", type=_count, default=1, metavar="K", help="sets of initial states; default: 1")
-    one.add_argument("--n", type=_count, help="initial states; default: 1000, with --quick 20")
-    one.add_argument("--iterations", type=_count, metavar="N",
-                     help="of Adam in the paper's method; default: 1000, with --quick 20")
-    one.add_argument("--grid", type=_grid, metavar="A,B,C", help="nodes of the level sets; default: 41,81,81")
-    one.add_argument("--ways", type=_words, metavar="A,B", help="rows, like rrt-100,cnd; default: all eight")
-    _add_control(table("gym", _reproduce_control, "acrobot and cart-pole by learned dynamics: CND, NMPC"))
-    one = table("quadrotor", _reproduce_control, "the quadrotor, f known and not: CND, NeuralOC, NMPC, LQR")
-    _add_control(one)
-    one.add_argument("--oc-iterations", type=_count, metavar="N",
-                     help="of Adam in NeuralOC; default: 6000 as published, with --quick 20")
-    one.add_argument("--oc-batch", type=_count, metavar="N",
-                     help="initial states in each of those; default: 1024 as published, with --quick 16")
-    one = table("approaches", _reproduce_approaches, "which approach gives what: time and memory by number of states")
-    one.add_argument("--problems", type=_words, metavar="A,B", help="default: six, of 2 to 12 states")
-
-
-def _add_control(one: argparse.ArgumentParser) -> None:
-    one.set_defaults(table=one.prog.split()[-1])
-    one.add_argument("--seeds", type=_count, metavar="K",
-                     help="of controllers, learned dynamics and initial states; default: 3, with --quick 1")
-    one.add_argument("--n", type=_count, help="initial states of each seed; default: 1000, with --quick 8")
-    one.add_argument("--iterations", type=_count, metavar="N",
-                     help="of Adam in the paper's method; default: 1000, with --quick 10")
-    one.add_argument("--ways", type=_words, metavar="A,B", help="rows, like cnd,nmpc; default: all that can be run")
-    one.add_argument("--shipped", action="store_true",
-                     help="nocl's default of seed 0 as it comes with nocl, instead of trained anew")
-
-
 def _add(sub: argparse.ArgumentParser, *names: str) -> None:
-    arguments: dict[str, tuple[str, dict[str, Any]]] = {
+    known: dict[str, tuple[str, dict[str, Any]]] = {
         "problem": ("problem", {"metavar": "NAME_OR_FILE", "help": "a problem's name, or a .py file with `ocp`"}),
-        "run": ("run", {"type": _folder, "metavar": "RUN", "help": "the folder of a run, like runs/cartpole"}),
-        "out": ("--out", {"type": _folder, "metavar": "DIR", "help": "default: runs/NAME"}),
-        "seed": ("--seed", {"type": _seed, "default": 0, "help": "of all that is drawn; default: 0"}),
-        "n": ("--n", {"type": _count, "default": 100, "help": "number of initial states; default: 100"}),
+        "run": ("run", {"type": arguments.folder, "metavar": "RUN", "help": "the folder of a run, like runs/cartpole"}),
+        "out": ("--out", {"type": arguments.folder, "metavar": "DIR", "help": "default: runs/NAME"}),
+        "seed": ("--seed", {"type": arguments.seed, "default": 0, "help": SEED + "; default: 0"}),
+        "n": ("--n", {"type": arguments.count, "default": 100, "help": "number of initial states; default: 100"}),
         "exact": ("--exact", {"action": "store_true", "help": "train on the exact dynamics, not on learned ones"}),
         "effort": ("--effort", {"choices": EFFORTS, "default": "normal", "help": "quick: to see whether it works, not "
                                 "how well; best: what gave the best results, in several times the time; default: "
                                 "normal"}),
         "quick": ("--quick", {"dest": "effort", "action": "store_const", "const": "quick",
                               "default": argparse.SUPPRESS, "help": "the same as --effort quick"}),
-        "intervals": ("--intervals", {"type": _count, "default": 80, "metavar": "N",
-                                      "help": "of NMPC and DDP; default: 80"}),
-        "methods": ("--methods", {"type": _methods, "default": ("CND", "NMPC"), "metavar": "A,B",
-                                  "help": f"of {', '.join(METHODS)}; default: CND,NMPC"})}
+        "intervals": ("--intervals", {"type": arguments.count, "default": 80, "metavar": "N",
+                                      "help": "of plans; default: 80"}),
+        "methods": ("--methods", {"type": arguments.methods, "default": ("cnd", "nmpc"), "metavar": "A,B",
+                                  "help": f"default: cnd,nmpc; {_told_of(registry.METHODS)}"})}
     for name in names:
-        flag, options = arguments[name]
+        flag, options = known[name]
         sub.add_argument(flag, **options)
+
+
+def _told_of(names: Iterable[str]) -> str:
+    """Methods by name, each with what it is."""
+    return "; ".join(f"{name}: {registry.METHODS[name].about}" for name in names)
 
 
 def _version() -> str:
     from nocl import __version__
 
     return f"nocl {__version__}"
-
-
-def _count(text: str) -> int:
-    return _whole(text, 1, MOST)
-
-
-def _workers(text: str) -> int | str:
-    return text if text == "auto" or "://" in text else _count(text)
-
-
-def _seed(text: str) -> int:
-    return _whole(text, 0, SEEDS - 1)
-
-
-def _whole(text: str, least: int, most: int) -> int:
-    """A number of least to most in the digits 0 to 9; int() alone also takes signs, underscores and other scripts."""
-    digits = text.isascii() and text.isdecimal() and len(text) <= len(str(most))
-    if not digits or not least <= int(text) <= most:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of at least {least} and at most {most}")
-    return int(text)
-
-
-def _folder(text: str) -> Path:
-    """A folder's name; a blank one, as of an unset variable, would be the current folder."""
-    if not text.strip() or "\0" in text:
-        raise argparse.ArgumentTypeError(f"{text!r} is no folder's name")
-    return Path(text)
-
-
-def _grid(text: str) -> tuple[int, ...]:
-    try:
-        return tuple(int(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r}; expected numbers of nodes, like 41,81,81") from None
-
-
-def _words(text: str) -> tuple[str, ...]:
-    return tuple(word.strip() for word in text.split(","))
-
-
-def _holds(text: str) -> tuple[int | None, ...]:
-    """Rates of feedback: continuous, and each number of intervals."""
-    return (None, *(_count(word.strip()) for word in text.split(",")))
-
-
-def _methods(text: str) -> tuple[str, ...]:
-    names = tuple(word.strip().upper() for word in text.split(","))
-    if not set(names) <= set(METHODS) or len(set(names)) < len(names):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a list of different methods of {', '.join(METHODS)}")
-    return names
-
-
-def _forms(text: str) -> tuple[str, ...]:
-    names = tuple(word.strip().lower() for word in text.split(","))
-    if not set(names) <= set(FORMS):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a list of {', '.join(FORMS)}")
-    return names
-
-
-def _nothing(args: argparse.Namespace) -> None:
-    """Of a command whose subcommands do the work."""
-
-
-def _reproduce_sysid(args: argparse.Namespace) -> None:
-    from nocl.comparisons.reproduce import sysid, sysid_tables
-
-    seeds, iterations = args.seeds or (1 if args.quick else 3), args.iterations or (1000 if args.quick else 50_000)
-    plan = sysid.Plan(iterations, seeds, args.systems or sysid.SYSTEMS, args.ways or sysid.Plan.ways, args.quick)
-    _check_out(args.out)
-    sysid.run(args.out, plan)
-    cells = sysid.finished(args.out)
-    paths = sysid_tables.write(args.out, cells)
-    print(sysid_tables.markdown(sysid.table(cells)), end="")
-    print("written:", ", ".join(map(str, paths)))
-
-
-def _reproduce_dubins(args: argparse.Namespace) -> None:
-    from dataclasses import replace
-
-    from nocl.comparisons.reproduce import dubins, dubins_tables
-
-    given = {"n": args.n, "seeds": args.seeds, "paper_iterations": args.iterations, "grid": args.grid,
-             "ways": args.ways}
-    plan = replace(dubins.PLANS[args.quick], **{name: value for name, value in given.items() if value is not None})
-    _check_out(args.out)
-    dubins.run(args.out, plan)
-    cells = dubins.finished(args.out)
-    paths = dubins_tables.write(args.out, cells)
-    print(dubins_tables.markdown(dubins.table(cells)), end="")
-    print("written:", ", ".join(map(str, paths)))
-
-
-def _reproduce_control(args: argparse.Namespace) -> None:
-    from nocl.comparisons.reproduce import control, control_tables
-
-    given = {name: getattr(args, name, None)
-             for name in ("n", "seeds", "iterations", "oc_iterations", "oc_batch", "ways")}
-    chosen = {name: value for name, value in given.items() if value is not None}
-    budgets = control.QUICK if args.quick else {}
-    plan = control.Plan(args.table, quick=args.quick, shipped=args.shipped, **(budgets | chosen))
-    _check_out(args.out)
-    control.run(args.out, plan)
-    cells = control.finished(args.out, plan.table)
-    paths = control_tables.write(args.out, cells, plan.table)
-    print(control_tables.markdown(control.table(cells, plan.table), plan.table), end="")
-    print("written:", ", ".join(map(str, paths)))
-
-
-def _reproduce_approaches(args: argparse.Namespace) -> None:
-    from nocl.comparisons.reproduce import approaches
-
-    plan = approaches.Plan(nodes=15 if args.quick else 31, problems=args.problems or approaches.PROBLEMS)
-    _check_out(args.out)
-    approaches.run(args.out, plan)
-    cells = approaches.finished(args.out)
-    paths = approaches.write(args.out, cells)
-    print(approaches.markdown(cells), end="")
-    print("written:", ", ".join(map(str, paths)))
 
 
 def _list(args: argparse.Namespace) -> None:
@@ -335,19 +165,8 @@ def _problem(args: argparse.Namespace) -> tuple[OCP, Path]:
     ocp = load_ocp(args.problem)
     name = Path(args.problem).stem if args.problem.endswith(".py") else args.problem
     out = args.out if args.out is not None else Path("runs") / name
-    _check_out(out)
+    arguments.check_out(out)
     return ocp, out
-
-
-def _check_out(out: Path) -> None:
-    """Whether files can be written under `out`, without writing any."""
-    for path in (out, *out.absolute().parents):
-        if path.exists():
-            if not path.is_dir():
-                raise ValueError(f"{path} is a file; expected a folder for the output: name another --out")
-            if not os.access(path, os.W_OK | os.X_OK):
-                raise ValueError(f"{path} cannot be written to; expected a folder of yours: name another --out")
-            return
 
 
 def _run(args: argparse.Namespace) -> None:
@@ -356,7 +175,7 @@ def _run(args: argparse.Namespace) -> None:
     ocp, out = _problem(args)
     stages = Stages(ocp, out, args.seed, args.effort)
     stages.check(exact=args.exact)
-    _other_methods(ocp, args.methods, args.intervals)
+    _refuse(ocp, args.methods, registry.Options(args.intervals, args.seed))
     cnd = stages.train(exact=args.exact)
     failed = _told(lambda: stages.export(cnd, out / "export", ("casadi", "c"), QUICK_PROOF))
     stages.compare(cnd, out / "report", args.methods, args.n, args.intervals)
@@ -408,7 +227,7 @@ def _export(args: argparse.Namespace) -> None:
     run = args.run
     cnd = load_run(run)
     out = args.out if args.out is not None else run / "export"
-    _check_out(out)
+    arguments.check_out(out)
     Stages(cnd.ocp, run, 0).export(cnd, out, tuple(dict.fromkeys(args.to or ("casadi", "c"))), args.against)
 
 
@@ -418,23 +237,20 @@ def _compare(args: argparse.Namespace) -> None:
     run = args.run
     cnd = load_run(run)
     out = args.out if args.out is not None else run / "report"
-    _check_out(out)
-    _other_methods(cnd.ocp, args.methods, args.intervals)
+    arguments.check_out(out)
     seed = int(cnd.card.get("seed", 0)) if args.seed is None else args.seed
+    _refuse(cnd.ocp, args.methods, registry.Options(args.intervals, seed))
     Stages(cnd.ocp, run, seed).compare(cnd, out, args.methods, args.n, args.intervals, args.hold, args.robust)
 
 
-def _other_methods(ocp: OCP, methods: Sequence[str], intervals: int) -> None:
+def _refuse(ocp: OCP, methods: Sequence[str], options: registry.Options) -> None:
     """ValueError for methods that cannot be built for this problem, or not be judged on it, before long work."""
-    from nocl.cli.run_folder import method
-
     if ocp.system.xdot is None:
         raise ValueError(f"the equations of {ocp.system.name!r} are not known (xdot=None), and methods are compared on "
                          "the exact f: give that System its equations, or take the controller to the plant itself "
                          "(nocl export) and see how far the model is right by nocl identify --data")
     for name in methods:
-        if name != "CND":
-            method(ocp, name, intervals)
+        registry.METHODS[name].refuse(ocp, options)
 
 
 if __name__ == "__main__":

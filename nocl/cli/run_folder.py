@@ -13,17 +13,22 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from nocl import __version__
+from nocl.comparisons.methods import is_plan, own_rate
+from nocl.judge import simulate
 from nocl.ocp import OCP
+from nocl.solvers import registry
 from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.settings import TrainSettings
 from nocl.solvers.cnd.training import train
 from nocl.support import store
+from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint, json_text, sha256
 from nocl.sysid.identification import LearnedDynamics, LogSettings, Settings, identify
 from nocl.sysid.logs.log import Log
@@ -126,11 +131,13 @@ class Stages:
         from nocl.comparisons.disturbances import mass_variants
         from nocl.comparisons.studies import study
 
-        chosen = {name: cnd if name == "CND" else method(self.ocp, name, intervals) for name in methods}
+        entries, options = [registry.METHODS[name] for name in methods], registry.Options(intervals, self.seed)
+        titles = ", ".join(entry.title for entry in entries)
+        say(f"comparing {titles} on {n} initial states, drawn with seed {fresh_seed(self.seed)}, on the exact dynamics")
+        chosen = {entry.title: entry.build(self.ocp, options) if entry.make else cnd for entry in entries}
         model = self._dynamics_there() if cnd.card.get("dynamics") == "learned" else None
         checkpoint = self._checkpoint(methods=list(methods), n=n, intervals=intervals, hold=str(hold), robust=robust,
                                       controller=fingerprint(cnd.to_casadi()))
-        say(f"comparing {', '.join(methods)} on {n} initial states, on the exact dynamics")
         report = study(self.ocp, chosen, n=n, seed=fresh_seed(self.seed), hold=hold, model=model, robust=robust,
                        variants=mass_variants(self.ocp) if robust else None, out=checkpoint)
         path = report.save(out)
@@ -208,62 +215,44 @@ def load_run(folder: Path) -> CND:
     return CND.load(folder / "cnd" if (folder / "cnd").is_dir() else folder)
 
 
-def method(ocp: OCP, name: str, intervals: int) -> Any:
-    """A method of the comparison other than CND, by name."""
-    from nocl.solvers.ddp.global_search import GlobalDDP
-    from nocl.solvers.ddp.solver import DDP
-    from nocl.solvers.lqr import LQR
-    from nocl.solvers.nmpc.solver import NMPC
-
-    match name.upper():
-        case "NMPC":
-            return NMPC(ocp, intervals=intervals)
-        case "NMPC-LOOP":
-            return NMPC(ocp, intervals=intervals).controller()
-        case "DDP":
-            return GlobalDDP(DDP(ocp, intervals=intervals))
-        case "LQR":
-            return LQR(ocp)
-    raise ValueError(f"method is {name!r}; expected NMPC, NMPC-LOOP, DDP or LQR")
-
-
 def solve(ocp: OCP, out: Path, name: str, n: int, seed: int, intervals: int, workers: int | str = "auto") -> None:
-    """Solve n initial states by one solver, and write OUT/NAME.npz (arrays), .json (messages) and a line of summary.
+    """Solve n initial states by one method, and write OUT/NAME.npz (arrays), .json (messages) and a line of summary.
 
-    What is solved is kept in OUT/checkpoint until all is: the same call goes on from there.
+    Feedback is simulated. What is solved is kept in OUT/checkpoint until all is: the same call goes on from there.
     """
-    from nocl.judge import simulate
-
-    solver, x0 = method(ocp, name, intervals), fresh_states(ocp, n, seed)
+    options, x0 = registry.Options(intervals, seed), fresh_states(ocp, n, seed)
+    registry.METHODS[name].refuse(ocp, options)
     start, checkpoint = time.perf_counter(), out / "checkpoint" / _solve_key(ocp, name, n, seed, intervals)
-    facts: dict[str, Any] = {"solver": name, "n": n, "seed": fresh_seed(seed)}
-    if name == "lqr":
-        s = simulate(ocp, solver, x0)
-        arrays = {"t": s.t, "x": s.x, "u": s.u, "cost": s.cost, "success": s.success}
-    else:
-        s, arrays, more = _solved(solver, x0, seed, workers, checkpoint)
-        facts |= more
+    method = registry.METHODS[name].build(ocp, options)
+    planned = is_plan(method)
+    s, arrays, facts = _solved(method, x0, workers, checkpoint) if planned else _simulated(ocp, method, x0)
     path = _write_arrays(out / f"{name}.npz", {"x0": x0, **arrays})
-    store.write_json(out / f"{name}.json", {**facts, "message": list(s.message)})
+    store.write_json(out / f"{name}.json", {"solver": name, "n": n, "seed": fresh_seed(seed), **facts,
+                                            "message": list(s.message)})
     _forget(checkpoint)
     ok = arrays["success"]
     mean = f", mean cost {arrays['cost'][ok].mean():.4g}" if ok.any() else ""
-    did = "simulated" if name == "lqr" else "solved"
-    say(f"{name}: {ok.sum()} of {n} {did}{mean}, {time.perf_counter() - start:.1f} s\n{path}")
+    say(f"{name}: {ok.sum()} of {n} {'solved' if planned else 'simulated'}{mean}, {time.perf_counter() - start:.1f} s; "
+        f"drawn with seed {fresh_seed(seed)}\n{path}")
 
 
-def _solved(solver: Any, x0: np.ndarray[Any, np.dtype[np.float64]], seed: int, workers: int | str,
+def _simulated(ocp: OCP, method: Any, x0: Array) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+    """(simulation, its arrays, nothing more) of feedback, at its own rate."""
+    s = simulate(ocp, method, x0, hold=own_rate(ocp, method))
+    return s, {"t": s.t, "x": s.x, "u": s.u, "cost": s.cost, "success": s.success}, {}
+
+
+def _solved(method: Any, x0: Array, workers: int | str,
             checkpoint: Path) -> tuple[Any, dict[str, Any], dict[str, Any]]:
-    """(solution, its arrays, how sure each optimum is) of NMPC, or of DDP from everywhere."""
-    from nocl.solvers.ddp.global_search import GlobalDDP, solve_globally
-
-    if isinstance(solver, GlobalDDP):
-        found = solve_globally(solver.ddp, x0, starts=solver.starts, seed=seed, workers=workers, out=checkpoint)
-        s, costate = found.best, found.best.V_x
-    else:
-        s = found = solver.solve(x0, workers=workers, out=checkpoint)
-        costate = s.costate
-    arrays = {"t": s.t, "x": s.x, "u": s.u, "cost": s.cost, "success": s.success, "costate": costate}
+    """(solution, its arrays, how sure each optimum is where the solver tried several starts)."""
+    ask = method.search if hasattr(method, "search") else method.solve
+    given, takes = {"workers": workers, "out": checkpoint}, signature(ask).parameters
+    found = ask(x0, **{key: value for key, value in given.items() if key in takes})
+    s = getattr(found, "best", found)
+    arrays = {"t": s.t, "x": s.x, "u": s.u, "cost": s.cost, "success": s.success,
+              "costate": s.costate if hasattr(s, "costate") else s.V_x}
+    if getattr(found, "starts", None) is None:
+        return s, arrays, {}
     return s, arrays, {"starts": found.starts, "hits": found.hits, "optima": [len(o) for o in found.optima]}
 
 

@@ -117,8 +117,18 @@ class GlobalDDP:
 
     def solve(self, x0: ArrayLike, workers: int | str = "auto", out: str | os.PathLike[str] | None = None,
               progress: bool | None = None) -> DDPSolution:
+        return self.search(x0, workers, out, progress).best
+
+    def search(self, x0: ArrayLike, workers: int | str = "auto", out: str | os.PathLike[str] | None = None,
+               progress: bool | None = None) -> GlobalSolution:
+        """The same with all that was found."""
         return solve_globally(self.ddp, x0, starts=self.starts, seed=self.seed, workers=workers, out=out,
-                              progress=progress).best
+                              progress=progress)
+
+
+def global_ddp(ocp: OCP, intervals: int, seed: int) -> GlobalDDP:
+    """DDP from everywhere, as the command line makes it."""
+    return GlobalDDP(DDP(ocp, intervals=intervals), seed=seed)
 
 
 class _Search:

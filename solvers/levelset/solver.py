@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import sys
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -54,6 +55,7 @@ except ImportError as error:
 SCHEMES = {"first": ("first_order", 1), "weno3": ("WENO3", 3), "weno5": ("WENO5", 3)}  # derivative; Runge-Kutta order
 PERIOD = 2 * math.pi
 SMALLEST = 8  # nodes along an axis
+STANDARD = {1: 401, 2: 161, 3: 61}  # nodes along each axis of `standard`, by the number of states
 EARLY = 1.5  # the k-th of n slices stands (k / n)^EARLY of the horizon before its end, where V changes fastest
 
 
@@ -298,6 +300,21 @@ class LevelSetSolution:
                              f"{problem.ocp.system.name!r} on {problem.grid}: solve again")
         return LevelSetSolution(problem, np.asarray(state["t"]), np.asarray(state["V"]), meta["seconds"],
                                 Prediction(*meta["prediction"]))
+
+
+def standard(ocp: OCP) -> LevelSet:
+    """Level sets on the problem's box, as the command line makes them; ValueError for more than 3 states."""
+    checks.problem(ocp, "level sets")
+    nx = ocp.system.nx
+    if nx not in STANDARD:
+        raise ValueError(f"level sets of {ocp.system.name!r}: the problem has {nx} states; expected at most "
+                         f"{max(STANDARD)}, since the nodes of a grid grow with their power: use nmpc or ddp")
+    return LevelSet(ocp, (STANDARD[nx],) * nx)
+
+
+def standard_solution(ocp: OCP) -> LevelSetSolution:
+    """V on that grid, solved."""
+    return standard(ocp).solve(progress=sys.stderr.isatty())
 
 
 @dataclass(frozen=True, eq=False)

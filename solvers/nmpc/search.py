@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nocl.solvers.nmpc.guesses import Guess
-from nocl.solvers.nmpc.transcription import FEASIBLE, Answer, Transcription
+from nocl.solvers.nmpc.transcription import FEASIBLE, NOT_A_NUMBER, STOPPED, Answer, Transcription
 from nocl.support.checks import Array
 
 SAME = 1e-3  # costs closer than this, relative, count as the same optimum
@@ -84,7 +84,7 @@ def _second_opinion(program: Transcription, task: Task, answers: Sequence[Answer
     """Where fatrop got stuck from all starts: IPOPT from its most feasible point, to solve it or to say why not."""
     if program.backend != "fatrop" or any(a.success for a in answers):
         return []
-    stuck = [a for a in answers if not a.message.startswith("stopped") and np.isfinite(a.x).all() and
+    stuck = [a for a in answers if a.outcome != STOPPED and np.isfinite(a.x).all() and
              np.isfinite(a.u).all()]
     if not stuck:
         return []
@@ -150,16 +150,17 @@ class Search:
             return self.refusal
         if self.best is not None:
             return self.best.message + _outside(self.program, self.x0)
-        reason = "nothing was tried" if self.failed is None else self.failed.message
+        reason, outcome = ("nothing was tried", "") if self.failed is None else \
+            (self.failed.message, self.failed.outcome)
         return (f"no start of {len(self.costs)} converged from x0 = {_text(self.x0)}{_outside(self.program, self.x0)}: "
-                f"{reason}; try {_remedy(reason, self.program)}")
+                f"{reason}; try {_remedy(outcome, self.program)}")
 
 
-def _remedy(reason: str, program: Transcription) -> str:
-    if reason.startswith("stopped"):
+def _remedy(outcome: str, program: Transcription) -> str:
+    if outcome == STOPPED:
         return f"more iterations (options={{'{program.backend}.max_iter': 3000}}), more starts or another guess"
     soft = ", or constraints='soft'" if program.n_path else ""
-    if reason.startswith("NaN"):
+    if outcome == NOT_A_NUMBER:
         return "a guess that stays where f, L and h are finite, or bounds lbu, ubu that keep the states there" + soft
     return "more starts, another guess, or more intervals" + soft
 

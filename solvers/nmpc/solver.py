@@ -211,6 +211,11 @@ class NMPC:
                            version("nocl"))
 
 
+def closed_loop(ocp: OCP, intervals: int, seed: int) -> Loop:
+    """NMPC as feedback, as the command line makes it."""
+    return NMPC(ocp, intervals, seed=seed).controller()
+
+
 @dataclass(frozen=True)
 class _Recipe:
     """What a program is built from, known by its key alone."""

@@ -34,6 +34,11 @@ WARM: dict[str, dict[str, Any]] = {  # near a solution: a barrier that is small 
 }
 FLAGS = ("-O2", "-march=native", "-fPIC", "-shared")  # of compiled programs
 FEASIBLE = 1e-6  # largest violation of a constraint in a solution, in the constraint's own unit
+# how a solve ended, by the names that CasADi has for all solvers, and in words
+OUTCOMES = {"SOLVER_RET_SUCCESS": "solved", "SOLVER_RET_LIMITED": "stopped at its limit of iterations or time",
+            "SOLVER_RET_INFEASIBLE": "infeasible", "SOLVER_RET_NAN": "NaN in a function",
+            "SOLVER_RET_UNKNOWN": "not converged"}
+STOPPED, NOT_A_NUMBER, INFEASIBLE = "SOLVER_RET_LIMITED", "SOLVER_RET_NAN", "SOLVER_RET_INFEASIBLE"
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +53,7 @@ class Answer:
     message: str
     violation: float  # the largest, of any constraint
     iterations: int
+    outcome: str  # how it ended: a key of OUTCOMES, or CasADi's own name
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,13 +191,14 @@ class Transcription:
         costate = -result["lam_g"].full().ravel()[self.gap_rows]
         worst, where = self.violation(result["g"].full().ravel(), t)
         iterations = int(stats.get("iter_count", 0))
-        status = words(stats, iterations >= self.max_iter)
+        outcome = outcome_of(stats, iterations >= self.max_iter)
+        status = words(stats, outcome)
         success = bool(stats["success"] and worst <= FEASIBLE and np.isfinite(X).all())
         if not success:
             status += f"; worst violation {worst:.3g} of {where}" if worst > FEASIBLE else \
                 ", at a feasible point that may not be optimal"
         cost = float(result["f"]) if success else np.inf
-        return Answer(X, U, costate, cost, success, status, worst, iterations)
+        return Answer(X, U, costate, cost, success, status, worst, iterations, outcome)
 
     @property
     def max_iter(self) -> float:
@@ -225,14 +232,16 @@ class Transcription:
         return float(excess[row]), f"{what} at node {node}, t = {t[node]:.4g}"
 
 
-def words(stats: dict[str, Any], limited: bool = False) -> str:
-    """The solver's status in words: solved, infeasible, out of iterations ...; limited: it used all its iterations."""
-    status, unified = stats.get("return_status", ""), str(stats.get("unified_return_status", ""))
-    plain = {"SOLVER_RET_SUCCESS": "solved", "SOLVER_RET_LIMITED": "stopped at its limit of iterations or time",
-             "SOLVER_RET_INFEASIBLE": "infeasible", "SOLVER_RET_NAN": "NaN in a function",
-             "SOLVER_RET_UNKNOWN": "not converged"}.get(unified, unified.lower())
-    if "Infeasible" in str(status):
-        plain = "infeasible"
-    elif limited and not stats.get("success"):
-        plain = "stopped at its limit of iterations"
+def outcome_of(stats: dict[str, Any], limited: bool = False) -> str:
+    """How a solve ended, a key of OUTCOMES where CasADi's name is one; limited: it used all its iterations."""
+    if "Infeasible" in str(stats.get("return_status", "")):  # IPOPT's own status: CasADi's name does not tell
+        return INFEASIBLE
+    if limited and not stats.get("success"):
+        return STOPPED
+    return str(stats.get("unified_return_status", ""))
+
+
+def words(stats: dict[str, Any], outcome: str) -> str:
+    """The outcome in words, with the solver's own status."""
+    status, plain = stats.get("return_status", ""), OUTCOMES.get(outcome, outcome.lower())
     return f"{plain} ({status})" if isinstance(status, str) and status else plain

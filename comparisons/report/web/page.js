@@ -25,7 +25,8 @@ const X0 = floats(D.x0), GAP = floats(D.gap);
 const x0 = (i, k) => X0[i * nx + k];
 const gap = (m, i) => GAP[m * B + i];
 const NUMBERS = D.methods.map((method) => floats(method.numbers));
-const number = (m, i, k) => NUMBERS[m][i * 8 + k];
+const column = (name) => D.numbers.indexOf(name);
+const number = (m, i, name) => NUMBERS[m][i * D.numbers.length + column(name)];
 const place = new Map((D.kept || Array.from({length: B}, (_, i) => i)).map((i, row) => [i, row]));
 const opened = new Map();
 const run = (m, i) => place.has(i) ? unpacked(D.methods[m], place.get(i), place.size) : null;
@@ -111,15 +112,15 @@ function drawMap() {
     yaxis: up === "gap" ? log("gap [%]") : axis({title: {text: LABELS[Number(up)]}}), showlegend: up === "gap" || traces.length > 2});
 }
 function outcome(m) {
-  const method = D.methods[m], failed = method.failed[state], cells = [0, 1, 2, 3].map((k) => text(number(m, state, k)));
-  const clearance = number(m, state, 5);
+  const method = D.methods[m], failed = method.failed[state], cells = ["cost", "running", "terminal", "error"].map((name) => text(number(m, state, name)));
+  const clearance = number(m, state, "clearance");
   return [`<span class=swatch style="border-color:${colour(m)}"></span>${MNAMES[m]}`,
           failed !== undefined ? "failed: " + safe(failed) : D.feasible[m][state] ? "+" + percent(gap(m, state)) : "violates a path constraint",
-          ...cells, `${(100 * number(m, state, 4)).toFixed(0)} %`, ...(Number.isFinite(clearance) || hasPath ? [text(clearance)] : []),
-          text(number(m, state, 6)), text(number(m, state, 7))];
+          ...cells, `${(100 * number(m, state, "saturation")).toFixed(0)} %`, ...(Number.isFinite(clearance) || hasPath ? [text(clearance)] : []),
+          text(number(m, state, "first")), text(number(m, state, "later"))];
 }
 const AUDITS = D.audits.map((audit) => ({...audit, values: floats(audit.values)}));
-const hasPath = NUMBERS.some((values) => values.some((v, k) => k % 8 === 5 && Number.isFinite(v)));
+const hasPath = NUMBERS.some((values) => values.some((v, k) => k % D.numbers.length === column("clearance") && Number.isFinite(v)));
 function drawOutcome() {
   const head = ["method", "gap", "cost", "running", "terminal", "|x(T) - x*|", "at a bound", ...(hasPath ? ["clearance"] : []),
                 "ms, first", "ms, later"];
@@ -179,9 +180,9 @@ function drawAlong() {
   D.methods.forEach((method, m) => {
     const r = run(m, state);
     if (!r) return;
-    traces.push({type: "scatter", mode: "lines", name: MNAMES[m], x: method.t, y: r[nx + nu], line: line(m, {dash: "solid"}),
+    traces.push({type: "scatter", mode: "lines", name: MNAMES[m], x: method.t, y: r[D.channels.togo], line: line(m, {dash: "solid"}),
                  hovertemplate: `${MNAMES[m]} still costs %{y:.4g}<extra>t = %{x:.3g}</extra>`});
-    if (r.length > nx + nu + 1) traces.push({type: "scatter", mode: "lines", name: `V along ${MNAMES[m]}`, x: method.t, y: r[nx + nu + 1],
+    if ("V" in D.channels) traces.push({type: "scatter", mode: "lines", name: `V along ${MNAMES[m]}`, x: method.t, y: r[D.channels.V],
       line: line(m, {dash: "dot", width: 2}), hovertemplate: `V of ${owner} along ${MNAMES[m]}: %{y:.4g}<extra>t = %{x:.3g}</extra>`});
   });
   $("alongnote").textContent = "What each run still costs, from t to the horizon" + (D.slices ? `; dotted: what ${D.slices.method}'s value function V(x(t), t) says along it.` : ".");
@@ -240,10 +241,10 @@ function drawEcdf() {
 function drawCosts() {
   const last = M - 1, values = [], traces = [];
   for (let m = 0; m < last; m++) {
-    const both = Array.from({length: B}, (_, i) => i).filter((i) => Number.isFinite(number(m, i, 0)) && Number.isFinite(number(last, i, 0)));
-    traces.push({type: "scatter", mode: "markers", name: MNAMES[m], x: both.map((i) => number(last, i, 0)), y: both.map((i) => number(m, i, 0)),
+    const both = Array.from({length: B}, (_, i) => i).filter((i) => Number.isFinite(number(m, i, "cost")) && Number.isFinite(number(last, i, "cost")));
+    traces.push({type: "scatter", mode: "markers", name: MNAMES[m], x: both.map((i) => number(last, i, "cost")), y: both.map((i) => number(m, i, "cost")),
       customdata: both, hovertext: both.map(hover), hoverinfo: "text", marker: {color: colour(m), size: 6, opacity: 0.7, symbol: ["circle", "square", "diamond", "triangle-up"][m % 4]}});
-    both.forEach((i) => values.push(number(m, i, 0), number(last, i, 0)));
+    both.forEach((i) => values.push(number(m, i, "cost"), number(last, i, "cost")));
   }
   if (!values.length) { draw("costs", [], {xaxis: axis(), yaxis: axis()}); return; }
   const low = values.reduce((a, b) => Math.min(a, b)), high = values.reduce((a, b) => Math.max(a, b));
@@ -282,7 +283,7 @@ function drawSlice() {
 }
 function drawTimes() {
   const traces = [];
-  [["first answer", 6], ["each later control", 7]].forEach(([what, c]) => D.methods.forEach((_, m) => {
+  [["first answer", "first"], ["each later control", "later"]].forEach(([what, c]) => D.methods.forEach((_, m) => {
     const x = Array.from({length: B}, (_, i) => number(m, i, c)).filter((v) => Number.isFinite(v) && v > 0);
     if (x.length) traces.push({type: "box", orientation: "h", x, y: x.map(() => what), name: MNAMES[m], legendgroup: String(m), offsetgroup: String(m),
       showlegend: !traces.some((trace) => trace.legendgroup === String(m)), boxpoints: false, line: {color: colour(m), width: 1.5}, hoverinfo: "x+name"});
