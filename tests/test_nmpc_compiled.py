@@ -38,13 +38,13 @@ def test_compiled_code_is_built_once_and_agrees(tmp_path, monkeypatch, solver):
     solution = fast.solve(x0, gains=True)
     assert [p.suffix for p in folder.iterdir()] == [".so"]
     assert len(built) == 1
-    from nocl.solvers.nmpc import solver
-    solver._program.cache_clear()  # as in another process
+    from nocl.solvers.nmpc import solver as module
+    module._program.cache_clear()  # as in another process
     assert (NMPC(nocl.load_ocp("pendulum"), **options).solve(x0).u == solution.u).all()
     assert len(built) == 1
     plain = NMPC(ocp, 10, starts=2, solver=solver).solve(x0, gains=True)
     assert solution.cost == pytest.approx(plain.cost, rel=1e-9)
-    assert solution.gains == pytest.approx(plain.gains, abs=1e-5)
+    assert solution.gain == pytest.approx(plain.gain, abs=1e-5)
 
 
 def test_the_environment_names_the_folder(tmp_path, monkeypatch):

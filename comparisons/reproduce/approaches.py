@@ -166,7 +166,7 @@ def _error(ocp: OCP, x0: Array, V: Any) -> float:
     from nocl.solvers.ddp.global_search import solve_globally
     from nocl.solvers.ddp.solver import DDP
 
-    best = solve_globally(DDP(ocp, intervals=REFERENCE), x0, seed=0).best
+    best = solve_globally(DDP(ocp, intervals=REFERENCE), x0, seed=0)
     wrong = np.abs(np.asarray(V).ravel() - best.cost) / best.cost
     return float(np.mean(wrong[best.success & np.isfinite(wrong)]))
 

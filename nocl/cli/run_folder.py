@@ -258,16 +258,13 @@ def solve(ocp: OCP, out: Path, name: str, n: int, seed: int, intervals: int, wor
 def _solved(solver: Any, x0: np.ndarray[Any, np.dtype[np.float64]], seed: int, workers: int | str,
             checkpoint: Path) -> tuple[Any, dict[str, Any], dict[str, Any]]:
     """(solution, its arrays, how sure each optimum is) of NMPC, or of DDP from everywhere."""
-    from nocl.solvers.ddp.global_search import GlobalDDP, solve_globally
+    from nocl.solvers.ddp.global_search import GlobalDDP
 
     if isinstance(solver, GlobalDDP):
-        found = solve_globally(solver.ddp, x0, starts=solver.starts, seed=seed, workers=workers, out=checkpoint)
-        s, costate = found.best, found.best.V_x
-    else:
-        s = found = solver.solve(x0, workers=workers, out=checkpoint)
-        costate = s.costate
-    arrays = {"t": s.t, "x": s.x, "u": s.u, "cost": s.cost, "success": s.success, "costate": costate}
-    return s, arrays, {"starts": found.starts, "hits": found.hits, "optima": [len(o) for o in found.optima]}
+        solver = replace(solver, seed=seed)
+    s = solver.solve(x0, workers=workers, out=checkpoint)
+    arrays = {"t": s.t, "x": s.x, "u": s.u, "cost": s.cost, "success": s.success, "costate": s.costate}
+    return s, arrays, {"starts": s.starts, "hits": s.hits, "optima": [len(o) for o in s.optima]}
 
 
 def _solve_key(ocp: OCP, *settings: Any) -> str:
