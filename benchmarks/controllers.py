@@ -32,6 +32,7 @@ from ddp import problem as load_problem
 
 import nocl
 from nocl.comparisons.reference import SLOTS, resolved
+from nocl.data import Solution
 from nocl.judge import Simulation, simulate
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
@@ -40,7 +41,7 @@ from nocl.solvers.cnd.labels import policy_controls
 from nocl.solvers.cnd.validate import feasible, kicked_optima, tube_optima, value_scores
 from nocl.solvers.ddp.bank import SolutionBank, better
 from nocl.solvers.ddp.global_search import cold_controls, solve_globally
-from nocl.solvers.ddp.solver import DDP, DDPSolution
+from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
 
 FINE = 640  # intervals of the reference
@@ -48,10 +49,10 @@ COLD = 48  # cold starts from each of the worst states
 VALUE_STATES = 2048  # of the tube, and of kicked rollouts, on which V is judged
 
 
-def optimum(ocp: OCP, x0: Array, policy: FeatureNet) -> tuple[DDPSolution, SolutionBank]:
+def optimum(ocp: OCP, x0: Array, policy: FeatureNet) -> tuple[Solution, SolutionBank]:
     """The best solutions known from x0, on FINE intervals; those found on the usual grid as a bank."""
     coarse, fine = DDP(ocp), DDP(ocp, intervals=FINE)
-    found = solve_globally(coarse, x0, starts=8, seed=99).best
+    found = solve_globally(coarse, x0, starts=8, seed=99)
     own = policy_controls(policy, nocl.to_torch(ocp.system.f), x0, np.zeros(len(x0)), ocp.horizon, FINE)
     best = better(fine.solve(x0, u=np.repeat(found.u, FINE // coarse.intervals, axis=1)), fine.solve(x0, u=own))
     return best, SolutionBank.of(coarse, found[found.success])

@@ -82,7 +82,7 @@ def speed(args: argparse.Namespace, name: str) -> dict:
                              tools=("nocl fatrop", "nocl fatrop compiled", "nocl ipopt", *others.OTHERS),
                              others=args.others)
     data = others.problem_data(name, few.states, few.intervals, few.seed)
-    mine = solve_globally(DDP(ocp, intervals=args.intervals), data["x0"], progress=False).best
+    mine = solve_globally(DDP(ocp, intervals=args.intervals), data["x0"], progress=False)
     again = DDP(ocp, intervals=args.intervals).solve(data["warm"], u=mine.u, x=mine.x, gain=mine.gain)
     for tool, row in others.tools(few, name)["tools"].items():
         if "warm ms median" in row:
@@ -105,14 +105,14 @@ def share(args: argparse.Namespace, name: str) -> dict:
     cpu = time.process_time()
     reference = solve_globally(ddp, x0, starts=48, neighbours=6, rounds=12, seed=args.seed + 4711, progress=False)
     cpu = time.process_time() - cpu
-    best = np.minimum(ours.best.cost, reference.best.cost)
+    best = np.minimum(ours.cost, reference.cost)
     nlp = NMPC(ocp, args.intervals, constraints="soft").solve(x0[:args.states], workers=1, progress=False)
     best[:args.states] = np.minimum(best[:args.states], nlp.cost)
-    within = ours.best.cost <= best + np.maximum(SAME * np.abs(best), 1e-10)
-    again = reference.best.cost <= best + np.maximum(SAME * np.abs(best), 1e-10)
-    beaten = nlp.cost < ours.best.cost[:args.states] - np.maximum(SAME * np.abs(nlp.cost), 1e-10)
+    within = ours.cost <= best + np.maximum(SAME * np.abs(best), 1e-10)
+    again = reference.cost <= best + np.maximum(SAME * np.abs(best), 1e-10)
+    beaten = nlp.cost < ours.cost[:args.states] - np.maximum(SAME * np.abs(nlp.cost), 1e-10)
     return {"states": args.many, "share at the best known": float(within.mean()), "solved": float(
-        ours.best.success.mean()), "reference's share": float(again.mean()), "NMPC better, of": [
+        ours.success.mean()), "reference's share": float(again.mean()), "NMPC better, of": [
         int(beaten.sum()), args.states], "starts a state": float(ours.starts.mean()), "seconds": seconds,
         "reference's cpu seconds": cpu, "optima a state": float(np.mean([len(o) for o in ours.optima]))}
 
@@ -121,7 +121,7 @@ def learned(args: argparse.Namespace, name: str) -> dict:
     """What tails on a learned f cost beside the same ones on the exact f."""
     ocp, rng = problem(name), np.random.default_rng(args.seed)
     exact = DDP(ocp, intervals=args.intervals, threads=1)
-    bank = SolutionBank.of(exact, solve_globally(exact, ocp.initial_states.sample(20, args.seed), progress=False).best)
+    bank = SolutionBank.of(exact, solve_globally(exact, ocp.initial_states.sample(20, args.seed), progress=False))
     rows, t0, x = tube_states(bank, TAILS, 0.2, ocp.horizon, rng)
     guess = bank.guess(rows, t0)
     result = {}

@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +24,10 @@ sys.path.insert(0, str(Path(__file__).parent))
 import provenance
 
 import nocl
+from nocl.data import Solution
 from nocl.judge import simulate
 from nocl.solvers.ddp.global_search import solve_globally
-from nocl.solvers.ddp.solver import DDP, DDPSolution
+from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
 from nocl.sysid.identification import LearnedDynamics, Settings, identify
 
@@ -34,19 +35,10 @@ PROBLEMS = ("cartpole", "acrobot", "quadrotor", "dubins")
 COARSE, FINE, STARTS = 80, 320, 16
 
 
-def optimum(ocp: nocl.OCP, model: LearnedDynamics | None, x0: Array) -> DDPSolution:
+def optimum(ocp: nocl.OCP, model: LearnedDynamics | None, x0: Array) -> Solution:
     """The best of STARTS cold starts for each state, on the fine grid; model None: the exact f."""
-    best = solve_globally(DDP(ocp, intervals=COARSE, dynamics=model), x0, starts=STARTS, seed=0).best
+    best = solve_globally(DDP(ocp, intervals=COARSE, dynamics=model), x0, starts=STARTS, seed=0)
     return DDP(ocp, intervals=FINE, dynamics=model).solve(x0, u=np.repeat(best.u, FINE // COARSE, axis=1))
-
-
-def feedback(solution: DDPSolution) -> Callable[[Array, float], Array]:
-    """u_k + K_k (x - x_k), each state its own."""
-    def ask(x: Array, t: float) -> Array:
-        k = min(round(t / solution.t[0, 1]), solution.u.shape[1] - 1)
-        return solution.u[:, k] + np.einsum("bij,bj->bi", solution.gain[:, k], x - solution.x[:, k])
-
-    return ask
 
 
 def models(problem: str, ocp: nocl.OCP, x0: Array, networks: bool) -> Iterator[tuple[str, LearnedDynamics]]:
@@ -62,7 +54,7 @@ def models(problem: str, ocp: nocl.OCP, x0: Array, networks: bool) -> Iterator[t
 def lost(ocp: nocl.OCP, model: LearnedDynamics | None, x0: Array, J: Array) -> dict[str, Any]:
     """Per cent lost against the costs J, as feedback, of the optimum of a model."""
     solution = optimum(ocp, model, x0)
-    run = simulate(ocp, feedback(solution), x0, hold=FINE)
+    run = simulate(ocp, solution.feedback, x0, hold=FINE)
     gap = 100 * (run.cost - J) / np.abs(J)
     good = np.isfinite(gap)
     q = np.quantile(gap[good], [0.5, 0.95, 1.0]) if good.any() else np.full(3, np.nan)
@@ -79,7 +71,7 @@ def main() -> None:
         ocp = nocl.load_ocp(problem)
         x0 = ocp.initial_states.sample(options.n, 1)
         exact = optimum(ocp, None, x0)
-        J = simulate(ocp, feedback(exact), x0, hold=FINE).cost
+        J = simulate(ocp, exact.feedback, x0, hold=FINE).cost
         for name, model in models(problem, ocp, ocp.initial_states.sample(options.n, 2), options.networks):
             start = time.perf_counter()
             row = {"problem": problem, "model": name, "n": options.n, "error": model.score().mean,

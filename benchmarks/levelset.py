@@ -63,7 +63,7 @@ def study(name: str, n: int) -> dict[str, Any]:
     """One row: the reference, errors on each grid and of Richardson's limit, CND's value, seconds."""
     ocp, plan = nocl.load_ocp(name), STUDIES[name]
     x = ocp.initial_states.sample(n, SEED)
-    found = solve_globally(DDP(ocp, intervals=INTERVALS), x, starts=8, rounds=4).best
+    found = solve_globally(DDP(ocp, intervals=INTERVALS), x, starts=8, rounds=4)
     x, J = x[found.success], found.cost[found.success]
     made = refine(ocp, plan.grids, x, max_seconds=7200.0, **plan.options())
     slope = plan.penalty_slope if math.isfinite(plan.penalty_slope) else None

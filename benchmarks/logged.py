@@ -23,7 +23,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
 import provenance
-from learned_optimum import FINE, feedback, lost, optimum
+from learned_optimum import FINE, lost, optimum
 
 import nocl
 from nocl.judge import simulate
@@ -98,7 +98,7 @@ def run_acrobot() -> None:
     model.validate(test, STEPS).plot().savefig(Path(__file__).parent.parent / "docs" / "logged.png", dpi=80)
     x0 = ocp.initial_states.sample(20, 1)
     row["outside"] = int(model.outside(x0).sum())
-    J = simulate(ocp, feedback(optimum(ocp, None, x0)), x0, hold=FINE).cost
+    J = simulate(ocp, optimum(ocp, None, x0).feedback, x0, hold=FINE).cost
     solution = optimum(ocp, model, x0)
     row["states outside"] = float(model.outside(solution.x[solution.success].reshape(-1, 4)).mean())
     row["lost"] = lost(ocp, model, x0, J)
@@ -181,9 +181,9 @@ def run_pendulum() -> None:
     row["seconds_train"] = round(time.perf_counter() - start, 1)
     x0 = ocp.initial_states.sample(30, 1)
     row["outside"] = int(model.outside(x0).sum())
-    planned = solve_globally(DDP(ocp, intervals=100, dynamics=model), x0, starts=8, seed=0).best
+    planned = solve_globally(DDP(ocp, intervals=100, dynamics=model), x0, starts=8, seed=0)
     row["n"] = len(x0)
-    each = [feedback(planned[i: i + 1]) for i in range(len(x0))]
+    each = [planned[i].feedback for i in range(len(x0))]
     for name, controllers in (("CND", [cnd] * len(x0)), ("DDP", each)):
         costs, ends = on_gym(controllers, x0, 100, ocp.L, ocp.G)
         tilt = np.abs((ends[:, 0] + np.pi) % (2 * np.pi) - np.pi)

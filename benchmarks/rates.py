@@ -33,7 +33,7 @@ FINE = 640
 
 def optimal_controls(ocp: OCP, x0: Array, K: int) -> Array:
     """The best controls known [B, K, nu], held over K intervals."""
-    best = solve_globally(DDP(ocp), x0, starts=8, seed=99).best
+    best = solve_globally(DDP(ocp), x0, starts=8, seed=99)
     ddp, nearest = DDP(ocp, intervals=K), ((np.arange(K) + 0.5) * best.u.shape[1] / K).astype(int)
     controls: Array = ddp.solve(x0, u=best.u[:, nearest]).u
     return controls

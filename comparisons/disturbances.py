@@ -118,7 +118,7 @@ class _Study:
         s, T = self.settings, self.ocp.horizon
         calm = self.judged("undisturbed", self.runs)
         guesses = [j.simulation.u[:, :-1] for j in calm]
-        cold = solve_globally(DDP(self.ocp), self.x0, starts=STARTS, seed=99, progress=self.progress).best.u
+        cold = solve_globally(DDP(self.ocp), self.x0, starts=STARTS, seed=99, progress=self.progress).u
         best = Reference(self.ocp, FINE, [cold, *guesses]).solve(self.x0)
         J = best.cost
         found = [self.scenario("undisturbed", "Nothing befalls the system.", self.runs, calm, J)]

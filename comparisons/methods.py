@@ -10,7 +10,6 @@
 from __future__ import annotations
 
 import inspect
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -148,7 +147,7 @@ def _held_name(name: str, rate: int | None) -> str:
 def _runs(ocp: OCP, name: str, method: Any, x0: Array, rates: Rates, solving: Solving) -> list[Run]:
     names = _names(ocp, name, method, rates)
     if is_plan(method):
-        parts = [(method, np.nan)] if isinstance(method, Solution) else solve(method, name, x0, solving)
+        parts = [method] if isinstance(method, Solution) else solve(method, name, x0, solving)
         return [planned(ocp, name, method, parts, len(x0))]
     policy = _policy(ocp, name, method)
     if policy is not None:
@@ -200,9 +199,9 @@ def _check_solution(ocp: OCP, name: str, solution: Solution, x0: Array) -> None:
         raise ValueError(f"method {name!r}: {wrong}")
 
 
-def _off_grid(ocp: OCP, solution: Any) -> str:
+def _off_grid(ocp: OCP, solution: Solution) -> str:
     """What is wrong with a solution's grid for running it in open loop, or ""."""
-    t = np.atleast_2d(solution.t)
+    t = solution.t
     if np.allclose(t, np.linspace(0.0, ocp.horizon, t.shape[1]), rtol=0, atol=1e-9 * ocp.horizon):
         return ""
     steps = np.diff(t)
@@ -210,15 +209,12 @@ def _off_grid(ocp: OCP, solution: Any) -> str:
             f"expected equal steps from 0 to the horizon {ocp.horizon:g}: compare it in closed loop, by controller()")
 
 
-def solve(solver: Any, name: str, x0: Array, solving: Solving) -> list[tuple[Any, float] | str]:
-    """(Solution, seconds a state) of all states at once; where that raises, state by state, what was raised instead."""
+def solve(solver: Any, name: str, x0: Array, solving: Solving) -> list[Solution | str]:
+    """The Solution of all states at once; where that raises, state by state, what was raised instead."""
     out = None if solving.out is None else solving.out / "solves" / folder_name(name)
     given = {"workers": solving.workers, "out": out, "progress": solving.progress}
     takes = inspect.signature(solver.solve).parameters
     options = {key: value for key, value in given.items() if key in takes}
-    kept = out if "out" in takes else None
-    begun = kept is not None and kept.exists()
-    start = time.perf_counter()
     try:
         solution = solver.solve(x0, **options)
     except Exception as error:  # a solver may raise anything: it becomes a row
@@ -226,49 +222,34 @@ def solve(solver: Any, name: str, x0: Array, solving: Solving) -> list[tuple[Any
             return [said(error)]
         alone = Solving(1, None, solving.progress)
         return [solve(solver, name, x[None], alone)[0] for x in x0]
-    return [(solution, _wall_time(time.perf_counter() - start, kept, begun) / len(x0))]
+    return [solution]
 
 
-def _wall_time(measured: float, kept: Path | None, begun: bool) -> float:
-    """Seconds that all solves took; of a run that was resumed those of the first one, NaN where it was cut off."""
-    if kept is None:
-        return measured
-    from nocl.support import store  # with torch
-
-    file = kept.with_name(f"{kept.name}.seconds")
-    if begun:
-        return float(file.read_text()) if file.exists() else float("nan")
-    store.write_bytes(file, repr(measured).encode())
-    return measured
-
-
-def planned(ocp: OCP, name: str, method: Any, parts: Sequence[tuple[Any, float] | str], B: int) -> Run:
+def planned(ocp: OCP, name: str, method: Any, parts: Sequence[Solution | str], B: int) -> Run:
     """The run of solutions that stand in the order of the states; a str is what a solve raised."""
-    K = max((part[0].u.shape[1] for part in parts if not isinstance(part, str)), default=1)
+    K = max((part.u.shape[1] for part in parts if not isinstance(part, str)), default=1)
     nx, nu = ocp.system.nx, ocp.system.nu
     message, u = list[str](), np.full((B, K, nu), np.nan)
     plan = Plan(np.full((B, K + 1, nx), np.nan), np.full((B, K + 1, nx), np.nan))
     ms, predicted, evaluations, solves = *np.full((3, B), np.nan), np.ones(B)
-    for part in parts:
+    for s in parts:
         i = len(message)
-        if isinstance(part, str):
-            message.append(part)
+        if isinstance(s, str):
+            message.append(s)
             continue
-        s, seconds = part
         rows = slice(i, i + len(s.u))
         u[rows], predicted[rows], plan.x[rows] = s.u, s.cost, s.x
-        plan.costate[rows] = s.costate if hasattr(s, "costate") else s.V_x
-        ms[rows] = 1e3 * np.asarray(getattr(s, "seconds", seconds))
+        plan.costate[rows] = s.costate
+        ms[rows] = 1e3 * s.seconds
         evaluations[rows] = s.iterations * K * STAGES * getattr(method, "substeps", 1)
-        starts = getattr(s, "starts", None)
-        solves[rows] = 1 if starts is None else np.maximum(starts, 1)
+        solves[rows] = np.maximum(s.starts, 1)
         message += _unsolved(ocp, s)
     u[[bool(m) for m in message]] = np.nan
     solved = Solved(ms, solves, predicted, evaluations, plan, message)
     return Run(name, f"open loop, held on {count(K, 'interval')}", method, u, solved=solved)
 
 
-def _unsolved(ocp: OCP, solution: Any) -> list[str]:
+def _unsolved(ocp: OCP, solution: Solution) -> list[str]:
     """"" for each state that a solver solved, else why its answer is not judged."""
     outcome = zip(solution.success, solution.message, strict=True)
     off_grid = _off_grid(ocp, solution)

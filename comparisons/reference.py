@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from nocl.comparisons.report import results
+from nocl.data import Solution
 from nocl.ocp import OCP
 from nocl.solvers.ddp.bank import better
-from nocl.solvers.ddp.solver import DDP, DDPSolution
+from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
 
 NAME = results.REFERENCE
@@ -31,7 +32,7 @@ class Reference:
     def __init__(self, ocp: OCP, intervals: int, guesses: Sequence[Array] = ()) -> None:
         self.ocp, self.intervals, self.guesses = ocp, intervals, list(guesses)
 
-    def solve(self, x0: Array) -> DDPSolution:
+    def solve(self, x0: Array) -> Solution:
         """The best solution of each state x0 [B, nx]; guesses are of the same states."""
         ddp = DDP(self.ocp, intervals=self.intervals)
         best = ddp.solve(x0)
@@ -42,7 +43,7 @@ class Reference:
         return best
 
 
-def resolved(ocp: OCP, start: DDPSolution, kicks: Sequence[tuple[int, Array]]) -> Array:
+def resolved(ocp: OCP, start: Solution, kicks: Sequence[tuple[int, Array]]) -> Array:
     """Cost [B] of the optimum that is solved anew after each kick (slot, dx [B, nx]), from the unkicked optimum;
     inf where a solve failed.
 

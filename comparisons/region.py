@@ -62,7 +62,7 @@ def succeeds(ocp: OCP, method: Any, x0: Array, within: float) -> Array:
     """[B] bool. A state that violates a constraint itself, or that nobody solves, is no success."""
     run = simulate(ocp, method, x0)
     own = simulate(ocp, method, x0, hold=HELD).u[:, :-1]
-    cold = solve_globally(DDP(ocp, intervals=HELD), x0, starts=STARTS, seed=0, workers=1, progress=False).best.u
+    cold = solve_globally(DDP(ocp, intervals=HELD), x0, starts=STARTS, seed=0, workers=1, progress=False).u
     rival = Reference(ocp, HELD, [own, cold]).solve(x0)
     judged = simulate(ocp, rival.u, x0)
     fair = rival.success & ~(judged.clearance < -VIOLATION)

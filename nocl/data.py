@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from nocl.sampling import Seed
 from nocl.support.checks import Array
 from nocl.system import System
+
+SAME = 1e-3  # costs closer than this, relative, count as the same optimum
+TINY = 1e-10  # ... and absolute: costs below it are equal
+ROUNDING = 1e-9  # of the time that a solution spans
 
 
 class Controller(Protocol):
@@ -64,54 +68,160 @@ class Trajectory:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Solutions of B optimal control problems; a failed one has success False and says why.
+    """Solutions of B optimal control problems, a row each, by any solver; a failed one has success False and says why.
 
-    `solution(t)` is (x, u, costate) at any time, by cubic Hermite polynomials between the nodes: [B, n], or
-    [B, len(t), n] for several times.
+    A row as feedback is u = u_k + gain_k (x - x_k) on [t_k, t_k+1), from every solver: `gain` is du/dx, and 0 for a
+    control that a bound holds. `LQR.K` alone has its field's sign, u = u* - K (x - x*). V, V_x, V_xx are the cost-to-go
+    at the nodes and its derivatives in x. NaN stands for what a solver does not know or was not asked for.
+
+    Rows: `solution[rows]`, `Solution.join`, `put`. In time: `solution(t)`, `solution.feedback(x, t)`.
     """
 
-    trajectory: Trajectory
+    t: Array  # [B, K+1], the nodes
+    x: Array  # [B, K+1, nx]; of a failed row NaN, or where its solver ended
+    u: Array  # [B, K, nu], held over [t_k, t_k+1)
+    gain: Array  # [B, K, nu, nx], du/dx; NaN also where there is no strict optimum
+    V: Array  # [B, K+1]
+    V_x: Array  # [B, K+1, nx]
     cost: Array  # [B], inf where the solve failed
-    costate: Array  # [B, K+1, nx], lambda = dJ*/dx at each node
-    success: Array  # [B] bool
-    message: Sequence[str]  # [B]
-    seconds: Array  # [B]
-    iterations: Array  # [B]
-    starts: Array | None = None  # [B], how many starts were tried
-    hits: Array | None = None  # [B], how many of them reached the best cost (within 0.1 %)
-    optima: Sequence[Array] | None = None  # [B] of [n, 2]: the costs of the local optima found, rising, starts at each
-    gains: Array | None = None  # [B, K, nu, nx], du_k = -gains dx_k stays optimal; NaN: no strict optimum
-    hessian: Array | None = None  # [B, K+1, nx, nx], d2J*/dx2 at each node; NaN as in gains
+    success: NDArray[np.bool_]  # [B]
+    message: NDArray[np.str_]  # [B]
+    seconds: Array  # [B], of all that was tried; a batch that was solved as one is shared out evenly
+    iterations: NDArray[np.int64]  # [B], of all that was tried
+    V_xx: Array | None = None  # [B, K+1, nx, nx]
+    tried: Array | None = None  # [B, n], the cost that each start ended at: inf, it failed; NaN, there were fewer
     dense: Array | None = None  # [B, K, 4, 2 nx]: (x, costate) at both ends of intervals, their time derivatives
 
-    @property
-    def t(self) -> Array:
-        return self.trajectory.t
+    def __len__(self) -> int:
+        return len(self.cost)
+
+    @staticmethod
+    def blank(t: Array, nx: int, nu: int) -> Solution:
+        """Rows without a solution yet, on the nodes t [B, K+1]."""
+        B, K = len(t), t.shape[1] - 1
+        x, u, gain, V = (np.full((B, *shape), np.nan) for shape in ((K + 1, nx), (K, nu), (K, nu, nx), (K + 1,)))
+        return Solution(t, x, u, gain, V, x.copy(), np.full(B, np.inf), np.zeros(B, dtype=bool),
+                        np.full(B, "not tried"), np.zeros(B), np.zeros(B, dtype=np.int64))
 
     @property
-    def x(self) -> Array:
-        return self.trajectory.x
+    def costate(self) -> Array:
+        """V_x by its other name."""
+        return self.V_x
 
     @property
-    def u(self) -> Array:
-        return self.trajectory.u
+    def starts(self) -> NDArray[np.int64]:
+        """How many starts were tried [B]."""
+        return (~np.isnan(self._tried)).sum(axis=1)
 
     @property
-    def value_gradient(self) -> Array:
-        """dJ*/dx0 [B, nx]."""
-        return self.costate[:, 0]
+    def hits(self) -> NDArray[np.int64]:
+        """How many of them ended at the best cost, SAME apart at most [B]."""
+        return hits(self._tried, self.cost)
+
+    @property
+    def optima(self) -> list[Array]:
+        """The costs of the local optima found, rising, and how many starts ended at each: [n, 2] for each row."""
+        return [distinct(costs) for costs in self._tried]
+
+    @property
+    def _tried(self) -> Array:
+        return self.cost[:, None] if self.tried is None else self.tried
+
+    def __getitem__(self, rows: Any) -> Solution:
+        """The solutions of some rows: a number, a slice, a mask or indices."""
+        rows = [rows] if isinstance(rows, (int, np.integer)) else rows
+        return Solution(**{name: value[rows] for name, value in self.arrays().items()})
+
+    @staticmethod
+    def join(parts: Iterable[Solution]) -> Solution:
+        """Several batches as one, without what one of them lacks."""
+        batches = list(parts)
+        most = max(batch._tried.shape[1] for batch in batches)
+
+        def column(name: str) -> Array | None:
+            values = [getattr(batch, name) for batch in batches]
+            if any(value is None for value in values):
+                return None
+            return np.concatenate([_widened(v, most) for v in values] if name == "tried" else values)
+
+        return Solution(**{name: column(name) for name in vars(batches[0])})  # type: ignore[arg-type]
+
+    def put(self, rows: Any, other: Solution) -> None:
+        """Overwrite some rows with another batch, in place; what it lacks becomes NaN there."""
+        for name, value in self.arrays().items():
+            new = getattr(other, name)
+            if name == "message":  # arrays of text are as wide as their longest
+                value = value.astype(np.promote_types(value.dtype, new.dtype), copy=False)
+            elif name == "tried":
+                most = max(value.shape[1], other._tried.shape[1])
+                value, new = _widened(value, most), _widened(other._tried, most)
+            value[rows] = np.nan if new is None else new
+            object.__setattr__(self, name, value)
+
+    def arrays(self) -> dict[str, Any]:
+        """Its fields as plain arrays, for a file; those that it lacks are left out."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+    @staticmethod
+    def of_arrays(arrays: dict[str, Any]) -> Solution:
+        """The solution of `arrays()`; ValueError where they are not those of a Solution."""
+        try:
+            return Solution(**arrays)
+        except TypeError as error:
+            raise ValueError(f"{', '.join(arrays)} are not the arrays of a Solution ({error}); expected what this "
+                             "version of nocl wrote: solve again") from error
+
+    def feedback(self, x: Array, t: float = 0.0) -> Array:
+        """u_k + gain_k (x - x_k) [B, nu] at states x [B, nx] of time t, one for each row; not clipped to U.
+
+        NaN where there is no gain; ValueError where no row has one.
+        """
+        if np.isnan(self.gain).all():
+            raise ValueError("this Solution has no `gain`: take that of NMPC.solve(x0, gains=True), or DDP's")
+        b, k = np.arange(len(self)), self._interval(np.array([t]))[:, 0]
+        return self.u[b, k] + np.einsum("bij,bj->bi", self.gain[b, k], x - self.x[b, k])
 
     def __call__(self, t: ArrayLike) -> tuple[Array, Array, Array]:
-        """(x, u, costate) at the time(s) t; ValueError outside the nodes' times, or where `dense` is missing."""
+        """(x, u, costate) at time t, [B, n], or at several times, [B, len(t), n]: cubic Hermite polynomials in `dense`.
+
+        Raises ValueError for times outside the nodes' and where `dense` is missing.
+        """
         times = np.asarray(t, dtype=np.float64)
         if self.dense is None:
             raise ValueError("this Solution has no `dense`, which solution(t) interpolates: NMPC.solve gives it")
-        if times.ndim > 1 or not ((times >= self.t[0]) & (times <= self.t[-1])).all():
-            raise ValueError(f"t is {t!r}; expected a time or a list of times in [{self.t[0]:g}, {self.t[-1]:g}]")
-        k = np.clip(np.searchsorted(self.t, times, side="right") - 1, 0, len(self.t) - 2)
-        h = np.diff(self.t)[k]
-        s = (times - self.t[k]) / h
+        first, last = self.t[:, 0].max(), self.t[:, -1].min()
+        if times.ndim > 1 or not ((times >= first) & (times <= last)).all():
+            raise ValueError(f"t is {t!r}; expected a time or a list of times in [{first:g}, {last:g}]")
+        b, k = np.arange(len(self))[:, None], self._interval(np.atleast_1d(times))
+        h = np.diff(self.t)[b, k]
+        s = (np.atleast_1d(times) - self.t[b, k]) / h
         ends, slopes = [(1 + 2 * s) * (1 - s) ** 2, s**2 * (3 - 2 * s)], [h * s * (1 - s) ** 2, h * s**2 * (s - 1)]
-        z = np.einsum("b...en,...e->b...n", self.dense[:, k], np.stack([*ends, *slopes], axis=-1))
-        nx = self.x.shape[2]
-        return z[..., :nx], self.u[:, k], z[..., nx:]
+        z = np.einsum("bken,bke->bkn", self.dense[b, k], np.stack([*ends, *slopes], axis=-1))
+        found = z[..., : self.x.shape[2]], self.u[b, k], z[..., self.x.shape[2]:]
+        x, u, costate = found if times.ndim else (value[:, 0] for value in found)
+        return x, u, costate
+
+    def _interval(self, times: Array) -> NDArray[np.int64]:
+        """The interval that each of n times lies in, for each row [B, n]; a node's, up to rounding, is the next one."""
+        slack = ROUNDING * (self.t[:, -1] - self.t[:, 0])
+        k = np.stack([np.searchsorted(nodes, times + s, side="right") for nodes, s in zip(self.t, slack, strict=True)])
+        return np.clip(k - 1, 0, self.u.shape[1] - 1)
+
+
+def distinct(costs: Array) -> Array:
+    """(cost, how many reached it) of each local optimum among costs, rising [n, 2]; inf and NaN stand for none."""
+    found = np.sort(costs[np.isfinite(costs)])
+    if not found.size:
+        return np.zeros((0, 2))
+    first = np.r_[True, np.diff(found) > np.maximum(SAME * np.abs(found[1:]), TINY)]
+    return np.c_[found[first], np.diff(np.r_[np.flatnonzero(first), len(found)])]
+
+
+def hits(tried: Array, best: Array) -> NDArray[np.int64]:
+    """How many of the costs tried [B, n] are the best [B]."""
+    near = tried <= (best + np.maximum(SAME * np.abs(best), TINY))[:, None]
+    return (near & np.isfinite(tried)).sum(axis=1)
+
+
+def _widened(tried: Array, columns: int) -> Array:
+    return np.pad(tried, ((0, 0), (0, columns - tried.shape[1])), constant_values=np.nan)

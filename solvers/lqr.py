@@ -97,7 +97,7 @@ class LQR:
         return (P + P.T) / 2
 
     def K(self, t: float = 0.0) -> Array:
-        """The gain at time t, [nu, nx]."""
+        """The gain at time t, [nu, nx], with its field's sign: u = u* - K (x - x*), where a Solution's `gain` is -K."""
         return self._gain(self.P(t))
 
     def __call__(self, x: ArrayLike, t: float = 0.0) -> Array:

@@ -13,7 +13,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, cast
 
@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from tqdm import tqdm
 
-from nocl.data import Solution, Trajectory
+from nocl.data import Solution
 from nocl.ocp import OCP
 from nocl.support import checks
 from nocl.support.checks import Array
@@ -85,15 +85,15 @@ class RRTStar:
         paths = [self.path(x, k) for k, x in enumerate(tqdm(rows, "RRT*", disable=not progress, leave=False))]
         h, K = self.ocp.horizon / self.intervals, self.intervals
         x, u = np.stack([p.x for p in paths]), np.full((len(rows), K, 2), np.nan)
-        message = [p.message or self._too_long(p) for p in paths]
+        message = np.array([p.message or self._too_long(p) for p in paths])
         for k, p in enumerate(paths):
             u[k] = np.c_[np.full(K, p.length / self.ocp.horizon), p.alpha]
         success = np.array([not m for m in message])
         L = self.ocp.L(x[:, :-1].reshape(-1, 3).T, u.reshape(-1, 2).T).full().reshape(len(rows), K).sum(axis=1) * h
         cost = np.where(success, L + self.ocp.G(x[:, -1].T).full().ravel(), np.inf)
-        t = np.linspace(0.0, self.ocp.horizon, K + 1)
-        return Solution(Trajectory(t, x, u), cost, np.full_like(x, np.nan), success, message,
-                        np.array([p.seconds for p in paths]), np.array([p.iterations for p in paths]))
+        blank = Solution.blank(np.tile(np.linspace(0.0, self.ocp.horizon, K + 1), (len(rows), 1)), 3, 2)
+        return replace(blank, x=x, u=u, cost=cost, success=success, message=message,
+                       seconds=np.array([p.seconds for p in paths]), iterations=np.array([p.iterations for p in paths]))
 
     def path(self, x0: Array, number: int = 0) -> Path:
         """The best path from one state; `number` varies the seed from state to state."""

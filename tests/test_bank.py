@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 import nocl
+from nocl.data import Solution
 from nocl.solvers.ddp.bank import SolutionBank, better, extend
-from nocl.solvers.ddp.global_search import GlobalDDP, GlobalSolution, clean, cold_controls, equilibria, solve_globally
-from nocl.solvers.ddp.solver import DDP, DDPSolution
+from nocl.solvers.ddp.global_search import GlobalDDP, clean, cold_controls, equilibria, solve_globally
+from nocl.solvers.ddp.solver import DDP
 
 N = 24
 
@@ -27,19 +28,19 @@ def states() -> np.ndarray:
 
 
 @lru_cache
-def straight() -> DDPSolution:
+def straight() -> Solution:
     return cartpole().solve(states())
 
 
 @lru_cache
-def found() -> GlobalSolution:
+def found() -> Solution:
     return solve_globally(cartpole(), states(), starts=6, neighbours=3, seed=1)
 
 
 @lru_cache
 def best_known() -> np.ndarray:
     """The least cost of 10 other cold starts a state, and of all that `found` tried."""
-    ddp, best = cartpole(), found().best.cost
+    ddp, best = cartpole(), found().cost
     controls = cold_controls(ddp, N * 10, 99).reshape(10, N, ddp.intervals, -1)
     for u in controls:
         best = np.minimum(best, ddp.solve(states(), u=u).cost)
@@ -48,28 +49,28 @@ def best_known() -> np.ndarray:
 
 @lru_cache
 def bank() -> SolutionBank:
-    return SolutionBank.of(cartpole(), found().best)
+    return SolutionBank.of(cartpole(), found())
 
 
 def test_the_best_known_optimum_is_found_where_a_straight_start_misses():
     missed = straight().cost > 1.01 * best_known()
     assert missed.mean() > 0.1
-    assert found().best.success.all()
-    assert (found().best.cost < 1.001 * best_known()).mean() > 0.95
+    assert found().success.all()
+    assert (found().cost < 1.001 * best_known()).mean() > 0.95
 
 
 def test_neighbours_improve_what_one_start_found():
     alone = solve_globally(cartpole(), states(), starts=1, neighbours=0, rounds=0)
-    assert np.array_equal(alone.best.cost, straight().cost)
+    assert np.array_equal(alone.cost, straight().cost)
     helped = solve_globally(cartpole(), states(), starts=1, neighbours=3)
-    assert (helped.best.cost <= alone.best.cost).all()
-    assert (helped.best.cost < 0.99 * alone.best.cost).sum() >= 1
-    assert (helped.best.cost < 1.001 * best_known()).mean() > (alone.best.cost < 1.001 * best_known()).mean()
+    assert (helped.cost <= alone.cost).all()
+    assert (helped.cost < 0.99 * alone.cost).sum() >= 1
+    assert (helped.cost < 1.001 * best_known()).mean() > (alone.cost < 1.001 * best_known()).mean()
 
 
 def test_a_mirror_image_has_the_mirrored_answer():
     x0 = states()[:6]
-    both = solve_globally(cartpole(), np.vstack([x0, -x0]), starts=3, neighbours=3, seed=4).best
+    both = solve_globally(cartpole(), np.vstack([x0, -x0]), starts=3, neighbours=3, seed=4)
     assert np.allclose(both.cost[:6], both.cost[6:], rtol=1e-6)
     same = np.abs(both.u[:6] + both.u[6:]).max(axis=(1, 2)) < 1e-4
     assert same.mean() > 0.8  # others have two optima of the same cost
@@ -78,7 +79,7 @@ def test_a_mirror_image_has_the_mirrored_answer():
 def test_a_pole_that_can_be_caught_is():
     """Random controls, in open loop, rarely stumble on the catch that the held goal starts from."""
     x0 = [[1.04, -0.03, -1.39, 3.44]]
-    assert solve_globally(cartpole(), x0, starts=2, rounds=0).best.cost[0] < 0.01
+    assert solve_globally(cartpole(), x0, starts=2, rounds=0).cost[0] < 0.01
     blind = cartpole().solve(np.repeat(x0, 20, axis=0), u=cold_controls(cartpole(), 20, 0))
     assert (blind.cost < 0.01).mean() < 0.2
 
@@ -100,7 +101,7 @@ def test_counts_of_starts_hits_and_optima():
     assert (r.starts > 6).all()
     assert ((r.hits >= 1) & (r.hits <= r.starts)).all()
     for i, optima in enumerate(r.optima):
-        assert optima[0, 0] == r.best.cost[i]
+        assert optima[0, 0] == r.cost[i]
         assert optima[0, 1] <= r.hits[i]
         assert optima[:, 1].sum() <= r.starts[i]
         assert (np.diff(optima[:, 0]) > 1e-3 * optima[1:, 0]).all()
@@ -108,15 +109,15 @@ def test_counts_of_starts_hits_and_optima():
 
 
 def test_same_seed_same_answer_however_many_threads():
-    few = [solve_globally(cartpole(), states()[:4], starts=3, rounds=1, seed=3, workers=w).best.u for w in ("auto", 2)]
+    few = [solve_globally(cartpole(), states()[:4], starts=3, rounds=1, seed=3, workers=w).u for w in ("auto", 2)]
     assert np.array_equal(*few)
 
 
 def test_one_state_alone_and_as_a_solver():
     r = solve_globally(cartpole(), states()[0], starts=4, seed=0)
-    assert r.best.cost.shape == (1,)
-    assert r.best.cost[0] <= straight().cost[0] * (1 + 1e-9)
-    assert np.array_equal(GlobalDDP(cartpole(), 4, 0).solve(states()[0]).cost, r.best.cost)
+    assert r.cost.shape == (1,)
+    assert r.cost[0] <= straight().cost[0] * (1 + 1e-9)
+    assert np.array_equal(GlobalDDP(cartpole(), 4, 0).solve(states()[0]).cost, r.cost)
 
 
 def test_progress_is_told():
@@ -143,7 +144,7 @@ def test_an_interrupted_search_goes_on_where_it_was(tmp_path, monkeypatch):
     solved.clear()
     monkeypatch.setattr(DDP, "descend", lambda self, batch: solved.append(batch.size) or descend(self, batch))
     again = solve_globally(cartpole(), x0, **options, out=tmp_path / "s")
-    assert np.array_equal(again.best.u, whole.best.u)
+    assert np.array_equal(again.u, whole.u)
     assert np.array_equal(again.starts, whole.starts)
     assert sum(solved) + 6 * 8 >= whole.starts.sum() > sum(solved)
     solved.clear()
@@ -252,7 +253,7 @@ def test_interpolation_is_the_local_model_of_the_nearest_solution():
 
 
 def test_a_bank_keeps_what_succeeded_and_comes_back_from_arrays():
-    s = found().best
+    s = found()
     failed = replace(s, success=np.arange(N) % 2 == 0)
     kept = SolutionBank.of(cartpole(), failed)
     assert len(kept) == N // 2
@@ -266,10 +267,12 @@ def test_a_bank_keeps_what_succeeded_and_comes_back_from_arrays():
         SolutionBank.of(cartpole(), replace(s, t=s.t + 0.5))
     with pytest.raises(ValueError, match="got no solutions"):
         SolutionBank.of(cartpole(), s[:0])
+    with pytest.raises(ValueError, match=r"by their gain, which is NaN: .*gains=True"):
+        SolutionBank.of(cartpole(), replace(s, gain=np.full_like(s.gain, np.nan)))
 
 
 def test_a_bank_grows_and_keeps_the_cheaper_of_two():
-    good, poor = found().best, straight()
+    good, poor = found(), straight()
     small = SolutionBank.of(cartpole(), poor[:10])
     grown = small.add(good)
     assert len(grown) == N
@@ -309,7 +312,7 @@ def test_a_saved_bank_is_the_same_and_others_are_refused(tmp_path):
 
 
 def test_better_takes_each_row_from_the_cheaper():
-    a, b = straight(), found().best
+    a, b = straight(), found()
     worse = replace(a, cost=np.where(np.arange(N) % 3 == 0, np.inf, a.cost))
     for first, second in ((worse, b), (b, worse)):
         merged = better(first, second)
@@ -333,13 +336,13 @@ def unsolvable() -> DDP:
 def test_states_without_a_solution_are_told_and_do_not_disturb_others():
     ddp = unsolvable()
     r = solve_globally(ddp, [[0.2], [50.0], [-0.3]], starts=3)
-    assert r.best.success.tolist() == [True, False, True]
+    assert r.success.tolist() == [True, False, True]
     assert r.hits[1] == 0
     assert len(r.optima[1]) == 0
-    assert np.isinf(r.best.cost[1])
-    assert "blows up" in r.best.message[1]
+    assert np.isinf(r.cost[1])
+    assert "blows up" in r.message[1]
     hopeless = solve_globally(ddp, [[50.0], [-60.0]], starts=2)
-    assert not hopeless.best.success.any()
+    assert not hopeless.success.any()
     assert hopeless.starts.tolist() == [2, 2]
 
 

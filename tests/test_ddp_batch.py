@@ -18,7 +18,7 @@ from nocl.solvers.ddp.solver import DDP
 
 def assert_same(a, b):
     for name, value in a.arrays().items():
-        assert np.array_equal(value, getattr(b, name)), name
+        assert name == "seconds" or np.array_equal(value, getattr(b, name)), name
 
 
 @lru_cache
@@ -122,15 +122,15 @@ def test_optimum_costates_and_gains_are_nmpcs(name):
     assert nlp.success.all()
     assert ours.success.all()
     assert np.abs(nlp.cost / ours.cost - 1).max() < 1e-6
-    assert np.abs(nlp.costate - ours.V_x).max() < 1e-5 * (1e-2 + np.abs(ours.V_x).max())
+    assert np.abs(nlp.V_x - ours.V_x).max() < 1e-5 * (1e-2 + np.abs(ours.V_x).max())
     s = ocp.system
-    known = np.isfinite(nlp.gains).all(axis=(2, 3))
+    known = np.isfinite(nlp.gain).all(axis=(2, 3))
     inside = ((ours.u > s.lbu + 1e-4) & (ours.u < s.ubu - 1e-4)).all(axis=2)  # which bounds are active: fatrop's guess
     free = known & np.logical_and.accumulate(inside[:, ::-1], axis=1)[:, ::-1]
     assert free.sum() > 10 or name == "dubins"  # there v is at its bound to the end
     for i in range(2):
         scale = np.abs(ours.gain[i][free[i]]).max(initial=1e-3)
-        assert np.abs(nlp.gains[i][free[i]] + ours.gain[i][free[i]]).max(initial=0.0) < 1e-3 * scale
+        assert np.abs(nlp.gain[i][free[i]] - ours.gain[i][free[i]]).max(initial=0.0) < 1e-3 * scale
 
 
 # Hard input: each problem on its own

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import nocl
+from nocl.data import Trajectory
 from nocl.judge import simulate
 from nocl.solvers import NMPC
 
@@ -50,7 +51,7 @@ def test_linear_quadratic_equals_riccati(solver):
         x = x @ A.T + u @ B.T
     assert solution.costate[:, N] == pytest.approx(2 * x, abs=1e-8)
     assert solution.success.all()
-    assert solution.t == pytest.approx(np.linspace(0, ocp.horizon, N + 1))
+    assert solution.t == pytest.approx(np.tile(np.linspace(0, ocp.horizon, N + 1), (4, 1)))
 
 
 @pytest.mark.parametrize("name", ["cartpole", "quadrotor", "dubins"])
@@ -63,7 +64,7 @@ def test_costate_is_the_gradient_of_the_optimal_cost(name):
     step = 1e-4
     for k in (0, 12):
         tail = nmpc if k == 0 else NMPC(ocp, 30 - k, starts=1, solver="ipopt")
-        nodes = best.t[k:]
+        nodes = best.t[0, k:]
         around = best.x[:, k] + step * np.vstack([np.eye(ocp.system.nx), -np.eye(ocp.system.nx)])
         guess = tuple(np.repeat(v[:, k:], len(around), axis=0) for v in (best.x, best.u))
         cost = tail.solve(around, guess, nodes=nodes).cost.reshape(2, -1)
@@ -201,7 +202,7 @@ def test_guesses():
     ocp = nocl.load_ocp("cartpole")
     nmpc, x0 = NMPC(ocp, 20, passes=0), ocp.initial_states.sample(2, 0)
     first = nmpc.solve(x0)
-    for guess in (first, first.trajectory, first.u, (first.x, first.u), [first, first.u]):
+    for guess in (first, Trajectory(first.t[0], first.x, first.u), first.u, (first.x, first.u), [first, first.u]):
         warm = nmpc.solve(x0, guess)
         assert warm.cost == pytest.approx(first.cost, rel=1e-9)
         assert (warm.starts == (2 if isinstance(guess, list) else 1)).all()
@@ -214,7 +215,7 @@ def test_tails_on_any_grid():
     ocp = nocl.load_ocp("cartpole")
     whole = NMPC(ocp, 40, starts=2).solve(ocp.initial_states.sample(1, 0))
     tail = NMPC(ocp, 30, starts=1).solve(whole.x[:, 10], (whole.x[:, 10:], whole.u[:, 10:]), t0=1.0)
-    assert tail.t == pytest.approx(whole.t[10:])
+    assert tail.t == pytest.approx(whole.t[:, 10:])
     assert tail.u == pytest.approx(whole.u[:, 10:], abs=1e-6)
     assert tail.costate == pytest.approx(whole.costate[:, 10:], abs=1e-6)
 

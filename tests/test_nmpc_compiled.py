@@ -44,7 +44,7 @@ def test_compiled_code_is_built_once_and_agrees(tmp_path, monkeypatch, solver):
     assert len(built) == 1
     plain = NMPC(ocp, 10, starts=2, solver=solver).solve(x0, gains=True)
     assert solution.cost == pytest.approx(plain.cost, rel=1e-9)
-    assert solution.gains == pytest.approx(plain.gains, abs=1e-5)
+    assert solution.gain == pytest.approx(plain.gain, abs=1e-5)
 
 
 def test_the_environment_names_the_folder(tmp_path, monkeypatch):

@@ -29,20 +29,20 @@ def test_linear_quadratic_equals_riccati():
     solution = nmpc.solve(ocp.initial_states.sample(2, 0), gains=True)
     _, _, gains, P = rk4_lq(ocp.horizon / N, N)
     for row in range(2):
-        assert solution.gains[row] == pytest.approx(np.array(gains), abs=1e-8)
-        assert solution.hessian[row] == pytest.approx(np.array(P), abs=1e-8)
-    assert solution.value_gradient == pytest.approx(solution.x[:, 0] @ P[0], abs=1e-8)
+        assert solution.gain[row] == pytest.approx(-np.array(gains), abs=1e-8)
+        assert solution.V_xx[row] == pytest.approx(np.array(P), abs=1e-8)
+    assert solution.V_x[:, 0] == pytest.approx(solution.x[:, 0] @ P[0], abs=1e-8)
 
 
 @pytest.mark.parametrize("name", ["cartpole", "acrobot", "quadrotor"])
-def test_gains_and_hessian_by_differences(name):
+def test_gain_and_V_xx_by_differences(name):
     """Acrobot has controls at their bounds on the way."""
     ocp = nocl.load_ocp(name)
     nmpc, x0 = NMPC(ocp, 20, starts=2, solver="ipopt"), ocp.initial_states.sample(1, 1)[0]
     solution = nmpc.solve(x0, gains=True)
     du, ddJ = changes(nmpc, x0)
-    assert -solution.gains[0, 0] == pytest.approx(du, abs=1e-4 * np.abs(du).max())
-    assert solution.hessian[0, 0] == pytest.approx(ddJ, abs=1e-4 * np.abs(ddJ).max())
+    assert solution.gain[0, 0] == pytest.approx(du, abs=1e-4 * np.abs(du).max())
+    assert solution.V_xx[0, 0] == pytest.approx(ddJ, abs=1e-4 * np.abs(ddJ).max())
     if name == "acrobot":
         assert (np.abs(solution.u) > 4.999).any()
 
@@ -54,18 +54,18 @@ def test_gains_on_active_bounds_and_an_active_wall(solver):
     solution = nmpc.solve(x0, gains=True)
     assert (solution.x[0, 1:, 0] < -0.1 + 1e-5).any()
     du, ddJ = changes(nmpc, x0)
-    assert -solution.gains[0, 0] == pytest.approx(du, rel=1e-3, abs=1e-3)
-    assert solution.hessian[0, 0] == pytest.approx(ddJ, rel=1e-3, abs=1e-3)
+    assert solution.gain[0, 0] == pytest.approx(du, rel=1e-3, abs=1e-3)
+    assert solution.V_xx[0, 0] == pytest.approx(ddJ, rel=1e-3, abs=1e-3)
     free = NMPC(walled(-3.0), 30, starts=1, solver=solver).solve(x0, gains=True)
-    assert np.abs(free.gains[0, 0] - solution.gains[0, 0]).max() > 0.1
+    assert np.abs(free.gain[0, 0] - solution.gain[0, 0]).max() > 0.1
 
     bounded = NMPC(walled(-3.0, u_max=0.3), 30, starts=1, solver=solver)
     held = bounded.solve([1.0, -0.5], gains=True)
-    assert (held.gains[0][np.abs(held.u[0]) > 0.3 - 1e-6] == 0).all()
+    assert (held.gain[0][np.abs(held.u[0]) > 0.3 - 1e-6] == 0).all()
     du, ddJ = changes(bounded, [1.0, -0.5])
     assert np.abs(held.u[0, 0]) > 0.3 - 1e-6
-    assert -held.gains[0, 0] == pytest.approx(du, abs=1e-5)
-    assert held.hessian[0, 0] == pytest.approx(ddJ, rel=1e-3, abs=1e-4)
+    assert held.gain[0, 0] == pytest.approx(du, abs=1e-5)
+    assert held.V_xx[0, 0] == pytest.approx(ddJ, rel=1e-3, abs=1e-4)
 
 
 def test_gains_round_an_obstacle_by_differences():
@@ -75,20 +75,20 @@ def test_gains_round_an_obstacle_by_differences():
     solution = nmpc.solve(x0, gains=True)
     assert (ocp.h(solution.x[0].T).full() < 1e-6).any()
     du, ddJ = changes(nmpc, x0)
-    assert -solution.gains[0, 0] == pytest.approx(du, abs=2e-3 * np.abs(du).max())
-    assert solution.hessian[0, 0] == pytest.approx(ddJ, abs=2e-3 * np.abs(ddJ).max())
+    assert solution.gain[0, 0] == pytest.approx(du, abs=2e-3 * np.abs(du).max())
+    assert solution.V_xx[0, 0] == pytest.approx(ddJ, abs=2e-3 * np.abs(ddJ).max())
 
 
 def test_feedback_by_gains_follows_problems_solved_again():
-    """u_k - K_k dx_k is the control of the tail solved again from x_k + dx to second order in dx."""
+    """u_k + gain_k dx_k is the control of the tail solved again from x_k + dx to second order in dx."""
     ocp, N, k = nocl.load_ocp("cartpole"), 30, 12
     nmpc = NMPC(ocp, N, starts=2)
     best = nmpc.solve(ocp.initial_states.sample(1, 0), gains=True)
     tail, errors = NMPC(ocp, N - k, starts=1), []
     for size in (2e-2, 1e-2):
         dx = size * np.array([1.0, -1.0, 1.0, 1.0])
-        u = tail.solve(best.x[:, k] + dx, (best.x[:, k:], best.u[:, k:]), nodes=best.t[k:]).u[0, 0]
-        errors.append(float(np.abs(u - (best.u[0, k] - best.gains[0, k] @ dx)).max()))
+        u = tail.solve(best.x[:, k] + dx, (best.x[:, k:], best.u[:, k:]), nodes=best.t[0, k:]).u[0, 0]
+        errors.append(float(np.abs(u - (best.u[0, k] + best.gain[0, k] @ dx)).max()))
     assert errors[0] / errors[1] == pytest.approx(4.0, rel=0.3)
 
 
@@ -98,7 +98,7 @@ def test_solution_of_time(name):
     ocp = nocl.load_ocp(name)
     nmpc = NMPC(ocp, 80, starts=2)
     solution = nmpc.solve(ocp.initial_states.sample(2, 3))
-    x, u, costate = solution(solution.t[:-1])
+    x, u, costate = solution(solution.t[0, :-1])
     assert x == pytest.approx(solution.x[:, :-1], abs=1e-9)
     assert (u == solution.u).all()
     free = np.ones(80, dtype=bool)
@@ -113,7 +113,7 @@ def test_solution_of_time(name):
                          0.0, 0.03, {"reltol": 1e-11, "abstol": 1e-12})
     for k in (0, 30, 55):
         end = flow(x0=np.r_[x[0, k], costate[0, k]], p=u[0, k])["xf"].full().ravel()
-        between = solution(solution.t[k] + 0.03)
+        between = solution(solution.t[0, k] + 0.03)
         assert np.r_[between[0][0], between[2][0]] == pytest.approx(end, abs=1e-4)
     assert solution(0.3)[0].shape == (2, s.nx)
     assert solution([0.3, 0.4])[2].shape == (2, 2, s.nx)
@@ -130,8 +130,8 @@ def test_no_strict_optimum_is_nan():
                    initial_states=nocl.Gaussian([1.0], [0.1]))
     solution = NMPC(ocp, 5, starts=1, solver="ipopt").solve([1.0], gains=True)
     assert solution.success[0]
-    assert np.isnan(solution.gains).all()
-    assert not np.isnan(solution.hessian[0, -1]).any()
+    assert np.isnan(solution.gain).all()
+    assert not np.isnan(solution.V_xx[0, -1]).any()
 
 
 def test_a_solution_of_another_nmpc_is_refused():

@@ -25,15 +25,15 @@ def test_a_short_horizon_with_the_value_function_is_the_whole_problem():
     whole = NMPC(ocp, N, starts=1).solve(x0)
     short = NMPC(ocp, n, horizon=0.6, terminal=lq_value(N), starts=1)
     part = short.solve(x0)
-    assert part.t == pytest.approx(whole.t[: n + 1])
+    assert part.t == pytest.approx(whole.t[:, : n + 1])
     assert part.cost == pytest.approx(whole.cost, abs=1e-9)
     assert part.u == pytest.approx(whole.u[:, :n], abs=1e-6)
     assert part.costate == pytest.approx(whole.costate[:, : n + 1], abs=1e-7)
     tail = short.solve(whole.x[:, 10], t0=1.0)
-    assert tail.t[-1] == pytest.approx(1.6)
+    assert tail.t[:, -1] == pytest.approx(1.6)
     assert tail.u == pytest.approx(whole.u[:, 10:16], abs=1e-6)
-    gains = short.solve(x0, gains=True).gains
-    assert gains[0] == pytest.approx(np.array(rk4_lq(2.0 / N, N)[2][:n]), abs=1e-7)
+    gain = short.solve(x0, gains=True).gain
+    assert gain[0] == pytest.approx(-np.array(rk4_lq(2.0 / N, N)[2][:n]), abs=1e-7)
 
 
 def test_a_terminal_cost_without_time_and_one_of_a_value_function_object():
@@ -78,9 +78,9 @@ def test_identified_dynamics():
     exact = NMPC(ocp, 30, starts=4).solve(x0)
     learned = NMPC(ocp, 30, dynamics=model, starts=4).solve(x0, exact, gains=True)
     assert learned.success.all()
-    assert np.isfinite(learned.gains).all()
+    assert np.isfinite(learned.gain).all()
     assert simulate(ocp, learned.u, x0).cost == pytest.approx(exact.cost, rel=0.05)
-    u = learned(learned.t[3])[1]
+    u = learned(learned.t[0, 3])[1]
     assert (u == learned.u[:, 3]).all()
 
 
@@ -130,7 +130,7 @@ def test_a_failed_step_holds_the_last_plan_and_is_flagged():
     loop(x0, 0.0)
     plan = loop.plan
     loop.nmpc = NMPC(ocp, 20, starts=1, options={"fatrop.max_iter": 1})
-    u = loop(plan.x[0, 3] + 0.3, plan.t[3])
+    u = loop(plan.x[0, 3] + 0.3, plan.t[0, 3])
     assert u == pytest.approx(plan.u[0, 3])
     assert loop.stats[-1]["source"].tolist() == ["last plan"]
     assert "limit of iterations" in loop.stats[-1]["message"][0]

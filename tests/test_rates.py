@@ -94,7 +94,7 @@ def test_without_control_dt_there_is_one_rate(cnd):
 def test_labels_of_other_rates_are_optimal_held_controls():
     ocp = nocl.load_ocp("double_integrator")
     ddp, rng = DDP(ocp, intervals=40), np.random.default_rng(0)
-    bank = SolutionBank.of(ddp, solve_globally(ddp, ocp.initial_states.sample(6, rng), starts=2).best)
+    bank = SolutionBank.of(ddp, solve_globally(ddp, ocp.initial_states.sample(6, rng), starts=2))
     labels = at_other_rates(ddp, tube(ddp, bank, 60, 0.2, rng), 1.0, rng)
     assert labels.dt.max() <= ocp.horizon / LONGEST * (1 + 1e-6)
     assert len(np.unique(labels.dt.round(9))) > 30

@@ -62,7 +62,7 @@ def pendulum():
     """(ocp, ddp, bank of solutions, f): no training."""
     ocp = nocl.load_ocp("pendulum")
     ddp, rng = DDP(ocp, intervals=40), np.random.default_rng(0)
-    seeds = solve_globally(ddp, ocp.initial_states.sample(6, rng), starts=4, seed=rng).best
+    seeds = solve_globally(ddp, ocp.initial_states.sample(6, rng), starts=4, seed=rng)
     bank = SolutionBank.of(ddp, seeds)
     more = extend(ddp, bank, ocp.initial_states.sample(40, rng))
     return ocp, ddp, SolutionBank.of(ddp, more), nocl.to_torch(ocp.system.f)
@@ -143,7 +143,7 @@ def test_pendulum_swings_up():
     cnd = nocl.train(ocp, settings=settings, seed=0, progress=False)
     x0 = ocp.initial_states.sample(20, 99)
     ddp = DDP(ocp, intervals=320)
-    best = solve_globally(ddp, x0, starts=6).best
+    best = solve_globally(ddp, x0, starts=6)
     gap = simulate(ocp, cnd, x0).cost / best.cost - 1
     assert np.median(gap) < 0.015
     assert np.quantile(gap, 0.95) < 0.06

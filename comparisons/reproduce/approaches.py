@@ -126,7 +126,7 @@ def _cnd(problem: str, plan: Plan) -> Cell:
 
 def _error(ocp: OCP, x0: Array, V: Any) -> float:
     """Mean |V - J| / J over the states; where V has no answer, the states are left out."""
-    best = solve_globally(DDP(ocp, intervals=REFERENCE), x0, seed=0).best
+    best = solve_globally(DDP(ocp, intervals=REFERENCE), x0, seed=0)
     wrong = np.abs(np.asarray(V).ravel() - best.cost) / best.cost
     return float(np.mean(wrong[best.success & np.isfinite(wrong)]))
 

@@ -135,7 +135,7 @@ def _nmpc(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
 
 def _optimum(ocp: OCP, x0: Array, seed: int, plan: Plan, folder: Path) -> Made:
     ddp, start = DDP(ocp, intervals=INTERVALS), time.perf_counter()
-    best = solve_globally(ddp, x0, seed=seed).best
+    best = solve_globally(ddp, x0, seed=seed)
     u = np.where(best.success[:, None, None], best.u, np.nan)
     return u, 1e3 * (time.perf_counter() - start) / len(x0), "DDP, best of many starts"
 

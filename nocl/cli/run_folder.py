@@ -245,15 +245,12 @@ def _simulated(ocp: OCP, method: Any, x0: Array) -> tuple[Any, dict[str, Any], d
 def _solved(method: Any, x0: Array, workers: int | str,
             checkpoint: Path) -> tuple[Any, dict[str, Any], dict[str, Any]]:
     """(solution, its arrays, how sure each optimum is where the solver tried several starts)."""
-    ask = method.search if hasattr(method, "search") else method.solve
-    given, takes = {"workers": workers, "out": checkpoint}, signature(ask).parameters
-    found = ask(x0, **{key: value for key, value in given.items() if key in takes})
-    s = getattr(found, "best", found)
-    arrays = {"t": s.t, "x": s.x, "u": s.u, "cost": s.cost, "success": s.success,
-              "costate": s.costate if hasattr(s, "costate") else s.V_x}
-    if getattr(found, "starts", None) is None:
+    given, takes = {"workers": workers, "out": checkpoint}, signature(method.solve).parameters
+    s = method.solve(x0, **{key: value for key, value in given.items() if key in takes})
+    arrays = {"t": s.t, "x": s.x, "u": s.u, "cost": s.cost, "success": s.success, "costate": s.costate}
+    if s.starts is None:
         return s, arrays, {}
-    return s, arrays, {"starts": found.starts, "hits": found.hits, "optima": [len(o) for o in found.optima]}
+    return s, arrays, {"starts": s.starts, "hits": s.hits, "optima": [len(o) for o in s.optima]}
 
 
 def _solve_key(ocp: OCP, *settings: Any) -> str:

@@ -11,9 +11,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from nocl.data import Solution
 from nocl.ocp import OCP
 from nocl.solvers.ddp.bank import SolutionBank, better
-from nocl.solvers.ddp.solver import DDP, DDPSolution
+from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
 from nocl.translate.rk4 import rk4
 from nocl.translate.torch_functions import to_torch
@@ -41,7 +42,7 @@ class Labels:
         return Labels(*(getattr(self, name)[rows] for name in Labels.__dataclass_fields__))
 
     @staticmethod
-    def held(solution: DDPSolution, unit: float) -> Labels:
+    def held(solution: Solution, unit: float) -> Labels:
         """Every interval of every solution that succeeded, at its start, as controls held for its length.
 
         unit: a usual cost; those far below it count as SMALL times it.
@@ -53,7 +54,7 @@ class Labels:
         return Labels(s.x[:, :-1].reshape(len(h), -1), s.t[:, :-1].ravel(), s.u.reshape(-1, nu), h / cost, h)
 
     @staticmethod
-    def of(solution: DDPSolution, f: Field, unit: float) -> Labels:
+    def of(solution: Solution, f: Field, unit: float) -> Labels:
         """The same as continuous controls: at the middle of its interval a held one equals them to second order.
 
         f in torch gives the states between nodes.
@@ -69,7 +70,7 @@ class Labels:
         return Labels(*(np.concatenate([getattr(p, name) for p in parts]) for name in Labels.__dataclass_fields__))
 
 
-def at_other_rates(ddp: DDP, solution: DDPSolution, unit: float, rng: np.random.Generator) -> Labels:
+def at_other_rates(ddp: DDP, solution: Solution, unit: float, rng: np.random.Generator) -> Labels:
     """Held controls from the same states as a solution's, each solved on another number of intervals, from its own."""
     done = solution[solution.success]
     left, most = ddp.ocp.horizon - done.t[:, 0], ddp.ocp.horizon / LONGEST * (1 + 1e-9)
@@ -85,7 +86,7 @@ def at_other_rates(ddp: DDP, solution: DDPSolution, unit: float, rng: np.random.
     return Labels.join(parts)
 
 
-def tube(ddp: DDP, bank: SolutionBank, n: int, width: float, rng: np.random.Generator) -> DDPSolution:
+def tube(ddp: DDP, bank: SolutionBank, n: int, width: float, rng: np.random.Generator) -> Solution:
     """Tails from n random states near the bank's trajectories, each from the solution it is near."""
     rows, t0, x = tube_states(bank, n, width, ddp.ocp.horizon, rng)
     return ddp.solve(x, t0, **bank.guess(rows, t0))
@@ -102,7 +103,7 @@ def tube_states(bank: SolutionBank, n: int, width: float, horizon: float,
 
 
 def visited(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, n: int, kick: float,
-            rng: np.random.Generator) -> DDPSolution:
+            rng: np.random.Generator) -> Solution:
     """Tails from n states that the policy visits under kicks."""
     x, t0 = kicked_states(ddp.ocp, bank, policy, f, n, kick, rng)
     return answered(ddp, bank, policy, f, x, t0)
@@ -123,7 +124,7 @@ def kicked_states(ocp: OCP, bank: SolutionBank, policy: torch.nn.Module, f: Fiel
     return x[fine], t0[fine]
 
 
-def answered(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, x: Array, t0: Array) -> DDPSolution:
+def answered(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, x: Array, t0: Array) -> Solution:
     """Tails from (x, t0): the better of a start from the policy's own answer and one from the nearest solution."""
     own = ddp.solve(x, t0, u=policy_controls(policy, f, x, t0, ddp.ocp.horizon, ddp.intervals))
     near = ddp.solve(x, t0, **bank.guess(bank.nearest(x, t0)[:, 0], t0))

@@ -26,6 +26,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
+from nocl.data import Solution
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.cnd.controller import CND
@@ -48,7 +49,7 @@ from nocl.solvers.cnd.validate import (
 from nocl.solvers.cnd.value import ValueLabels, on_fine_grid, value_loss, value_net, value_tails
 from nocl.solvers.ddp.bank import SolutionBank, extend
 from nocl.solvers.ddp.global_search import solve_globally
-from nocl.solvers.ddp.solver import DDP, DDPSolution
+from nocl.solvers.ddp.solver import DDP
 from nocl.support import store
 from nocl.support.checks import Array
 from nocl.support.threads import one_thread
@@ -167,7 +168,7 @@ class _Training:
                 bar.update()
 
             seeds = solve_globally(self.ddp, self.ocp.initial_states.sample(s.seeds, rng), starts=s.starts, seed=rng,
-                                   report=report).best
+                                   report=report)
             self.bank = SolutionBank.of(self.ddp, seeds)
             if s.states:
                 more = extend(self.ddp, self.bank, self.ocp.initial_states.sample(s.states, rng))
@@ -176,7 +177,7 @@ class _Training:
             self.labels = Labels.join([self._labels(p, rng) for p in parts])
             self.first = len(self.labels)
 
-    def _labels(self, solution: DDPSolution, rng: np.random.Generator) -> Labels:
+    def _labels(self, solution: Solution, rng: np.random.Generator) -> Labels:
         """Labels of the continuous controls, and with control_dt of held ones."""
         parts = [Labels.of(solution, self.f, self._unit())]
         if self.settings.control_dt:
@@ -263,7 +264,7 @@ class _Training:
         self.value_card = {"loss": losses, "labels": len(labels), "tried": tried, **judged, **best}
         return net
 
-    def _value_optima(self) -> dict[str, DDPSolution]:
+    def _value_optima(self) -> dict[str, Solution]:
         """What V is told by: initial states, states of the tube, and states of kicked rollouts, solved anew; those that
         can hold the path constraints, where there are any."""
         s, rng = self.settings, self._rng(3_000_000)

@@ -7,38 +7,39 @@ from typing import Any
 import numpy as np
 import torch
 
+from nocl.data import Solution
 from nocl.hjb import hjb_residual, rollout
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.cnd.labels import SMALL, Field, answered, continuous_cost, kicked_states, tube_states
 from nocl.solvers.ddp.bank import SolutionBank, extend
-from nocl.solvers.ddp.solver import DDP, DDPSolution
+from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
 from nocl.translate.torch_functions import to_torch
 
 NODES = 16  # of each solution at which the HJB residual is taken
 
 
-def refined(fine: DDP, coarse: DDPSolution) -> DDPSolution:
+def refined(fine: DDP, coarse: Solution) -> Solution:
     """The solutions that succeeded, solved again on the fine grid."""
     s = coarse[coarse.success]
     finer = fine.solve(s.x[:, 0], s.t[:, 0], u=np.repeat(s.u, fine.intervals // s.u.shape[1], axis=1))
     return finer[finer.success]
 
 
-def held_out_optima(ddp: DDP, fine: DDP, bank: SolutionBank, x0: Array) -> DDPSolution:
+def held_out_optima(ddp: DDP, fine: DDP, bank: SolutionBank, x0: Array) -> Solution:
     """The optima of fresh initial states, from the bank's nearest."""
     return refined(fine, extend(ddp, bank, x0))
 
 
 def kicked_optima(ddp: DDP, fine: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, n: int, kick: float,
-                  rng: np.random.Generator) -> DDPSolution:
+                  rng: np.random.Generator) -> Solution:
     """The optima from n states that the policy visits under kicks, at times all over the horizon."""
     x, t0 = kicked_states(ddp.ocp, bank, policy, f, n, kick, rng)
     return refined(fine, answered(ddp, bank, policy, f, x, t0))
 
 
-def feasible(ocp: OCP, s: DDPSolution) -> DDPSolution:
+def feasible(ocp: OCP, s: Solution) -> Solution:
     """The solutions that hold the path constraints at all nodes: where a collision can no longer be avoided, V is that
     of the penalty."""
     if not ocp.path_constraints:
@@ -48,20 +49,20 @@ def feasible(ocp: OCP, s: DDPSolution) -> DDPSolution:
 
 
 def tube_optima(ddp: DDP, fine: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, n: int, width: float,
-                rng: np.random.Generator) -> DDPSolution:
+                rng: np.random.Generator) -> Solution:
     """The optima from n states of the tube."""
     _, t0, x = tube_states(bank, n, width, ddp.ocp.horizon, rng)
     return refined(fine, answered(ddp, bank, policy, f, x, t0))
 
 
-def gap(ocp: OCP, policy: torch.nn.Module, f: Field, best: DDPSolution, unit: float = 0.0) -> Array:
+def gap(ocp: OCP, policy: torch.nn.Module, f: Field, best: Solution, unit: float = 0.0) -> Array:
     """(J - J*) / (|J*| + SMALL unit) [B] of the policy as continuous feedback, from where the solutions start."""
     J = continuous_cost(ocp, policy, f, best.x[:, 0], best.u.shape[1], best.t[:, 0])
     shares: Array = (J - best.cost) / (np.abs(best.cost) + SMALL * unit)
     return shares
 
 
-def held_gap(ocp: OCP, policy: torch.nn.Module, f: Field, best: DDPSolution) -> Array:
+def held_gap(ocp: OCP, policy: torch.nn.Module, f: Field, best: Solution) -> Array:
     """The same of a policy that is asked at the solutions' nodes and held; they start at t = 0."""
     with torch.no_grad():
         path = rollout(policy, f, to_torch(ocp.L_soft), torch.from_numpy(best.x[:, 0]), ocp.horizon, best.u.shape[1])
@@ -78,7 +79,7 @@ def summary(shares: Array, name: str) -> dict[str, float]:
 
 
 def value_scores(ocp: OCP, value: FeatureNet, policy: torch.nn.Module, f: Field,
-                 optima: dict[str, DDPSolution]) -> dict[str, float]:
+                 optima: dict[str, Solution]) -> dict[str, float]:
     """|V - J*| / |J*| (mean and median), V_x against costates (medians) of each set of optima; the HJB residual.
 
     The residual V_t + L + V_x' f is taken at the policy's u along the last set, in units of its mean running cost.
@@ -103,7 +104,7 @@ def _value_and_slope(value: FeatureNet, x: Array, t: Array) -> tuple[Array, Arra
     return V.detach().numpy()[:, 0], slope.numpy()
 
 
-def _hjb(ocp: OCP, value: FeatureNet, policy: torch.nn.Module, f: Field, tails: DDPSolution) -> dict[str, float]:
+def _hjb(ocp: OCP, value: FeatureNet, policy: torch.nn.Module, f: Field, tails: Solution) -> dict[str, float]:
     every = slice(0, -1, max(tails.u.shape[1] // NODES, 1))
     x = torch.from_numpy(np.ascontiguousarray(tails.x[:, every].reshape(-1, tails.x.shape[2])))
     t = torch.from_numpy(np.ascontiguousarray(tails.t[:, every].reshape(-1, 1)))

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nocl.data import Solution
 from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.cnd.features import features
@@ -24,7 +25,7 @@ from nocl.solvers.cnd.loss_kernel import ValueKernel
 from nocl.solvers.cnd.regress import Loss
 from nocl.solvers.cnd.validate import refined
 from nocl.solvers.ddp.bank import SolutionBank
-from nocl.solvers.ddp.solver import DDP, DDPSolution
+from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
 from nocl.support.compiler import NoCompilerError
 from nocl.translate.arguments import Arguments
@@ -49,7 +50,7 @@ class ValueLabels:
         return len(self.V)
 
     @staticmethod
-    def of(solutions: Iterable[DDPSolution]) -> ValueLabels:
+    def of(solutions: Iterable[Solution]) -> ValueLabels:
         """Start, end and nodes at doubling distances between them: later nodes have drawn together and tell little."""
         names, parts = list(ValueLabels.__dataclass_fields__), []
         for s in solutions:
@@ -67,7 +68,7 @@ class ValueLabels:
 
 
 def value_tails(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, *, initial: int, tails: int,
-                visits: int, width: float, kick: float, rng: np.random.Generator) -> DDPSolution:
+                visits: int, width: float, kick: float, rng: np.random.Generator) -> Solution:
     """Solutions from initial states, and tails from states of the tube and from those that the policy visits under
     kicks."""
     x0 = ddp.ocp.initial_states.sample(initial, rng)
@@ -77,7 +78,7 @@ def value_tails(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field,
     return answered(ddp, bank, policy, f, x, t)
 
 
-def on_fine_grid(fine: DDP, coarse: DDPSolution) -> Iterator[DDPSolution]:
+def on_fine_grid(fine: DDP, coarse: Solution) -> Iterator[Solution]:
     """The solutions that succeeded on both grids: a held control costs O(h^2) more than a continuous one. Piece by
     piece, since they take much memory."""
     for start in range(0, len(coarse), PIECE):

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 
-from nocl.solvers.ddp.solver import DDP, DDPSolution
+from nocl.data import Solution
+from nocl.solvers.ddp.solver import DDP
 from nocl.support import checks
 from nocl.support.checks import Array
 
@@ -25,14 +26,14 @@ EQUAL = 1e-9  # of the scale: states closer than this are the same
 class SolutionBank:
     """Solutions on [0, T], one a row, as guesses for other problems (x0, t0)."""
 
-    solution: DDPSolution
+    solution: Solution
     scale: Array  # [nx], one unit of distance in each state
 
     def __len__(self) -> int:
         return len(self.solution)
 
     @staticmethod
-    def of(ddp: DDP, solution: DDPSolution) -> SolutionBank:
+    def of(ddp: DDP, solution: Solution) -> SolutionBank:
         """A bank of the solutions that succeeded; states are compared in units of their spread along them."""
         if (solution.t[:, 0] != 0).any():
             raise ValueError(f"a bank holds solutions from t0 = 0; got t0 up to {solution.t[:, 0].max():g}: solve them "
@@ -43,21 +44,24 @@ class SolutionBank:
         if not len(kept):
             raise ValueError(f"no problem of {ddp.ocp.system.name} was solved ({solution.message[0]}): check the "
                              "horizon, the bounds and the costs, or give guesses of your own to DDP.solve(x0, u=...)")
-        return SolutionBank(kept, spread(ddp, kept))
+        if np.isnan(kept.gain).any():
+            raise ValueError(f"a bank follows its solutions of {ddp.ocp.system.name} by their gain, which is NaN: "
+                             "take those of DDP, or of NMPC.solve(x0, gains=True)")
+        return SolutionBank(replace(kept, tried=None, dense=None), spread(ddp, kept))
 
     @staticmethod
     def from_arrays(ddp: DDP, arrays: dict[str, Any]) -> SolutionBank:
         """The bank of a solution's arrays, as a checkpoint keeps them."""
         return SolutionBank.of(ddp, _solution(arrays))
 
-    def add(self, solution: DDPSolution) -> SolutionBank:
+    def add(self, solution: Solution) -> SolutionBank:
         """A bank with these solutions too, those that succeeded; of two from the same state the cheaper stays."""
         grid = self.solution.u.shape[1:]
         if solution.u.shape[1:] != grid or (solution.t != self.solution.t[0]).any():
             raise ValueError(f"the bank's solutions have controls {grid} on [0, {self.horizon:g}]; got controls "
                              f"{solution.u.shape[1:]} from t0 up to {solution.t[:, :1].max(initial=0):g}: solve them "
                              "by the same DDP, from t0 = 0")
-        joined = DDPSolution.join([_plain(self.solution), _plain(solution[solution.success])])
+        joined = Solution.join([self.solution, solution[solution.success]])
         order = np.argsort(joined.cost, kind="stable")
         state = np.round(joined.x[order, 0] / (EQUAL * self.scale))
         kept = order[np.sort(np.unique(state, axis=0, return_index=True)[1])]
@@ -152,19 +156,19 @@ class SolutionBank:
         return np.clip((np.asarray(t) * K / self.horizon).astype(np.int64), 0, K - 1)
 
 
-def spread(ddp: DDP, solution: DDPSolution) -> Array:
+def spread(ddp: DDP, solution: Solution) -> Array:
     """The states' standard deviations along solutions [nx], at least 5 % of X."""
     box = np.asarray(ddp.ocp.system.ubx) - ddp.ocp.system.lbx
     return np.asarray(np.maximum(solution.x.std(axis=(0, 1)), 0.05 * box))
 
 
-def extend(ddp: DDP, bank: SolutionBank, x0: ArrayLike, neighbours: int = 3, t0: ArrayLike = 0.0) -> DDPSolution:
+def extend(ddp: DDP, bank: SolutionBank, x0: ArrayLike, neighbours: int = 3, t0: ArrayLike = 0.0) -> Solution:
     """Solve new problems (x0 [B, nx], t0) from the nearest solutions of a bank: the best of `neighbours` starts each.
     """
     if neighbours < 1:
         raise ValueError(f"neighbours is {neighbours}; expected at least 1")
     rows, _ = checks.states(x0, ddp.ocp.system.nx, ddp.ocp.system.name)
-    best: DDPSolution | None = None
+    best: Solution | None = None
     for near in bank.nearest(rows, t0, count=neighbours).T:
         solution = ddp.solve(rows, t0, **bank.guess(near, t0))
         best = solution if best is None else better(best, solution)
@@ -172,22 +176,15 @@ def extend(ddp: DDP, bank: SolutionBank, x0: ArrayLike, neighbours: int = 3, t0:
     return best
 
 
-def better(a: DDPSolution, b: DDPSolution) -> DDPSolution:
-    """The cheaper of two solutions of each problem."""
-    swap = b.cost < a.cost
-    merged: dict[str, Any] = {}
-    for name, value in vars(a).items():
-        other = getattr(b, name)
-        merged[name] = None if value is None or other is None else np.where(
-            swap.reshape(-1, *[1] * (value.ndim - 1)), other, value)
-    return DDPSolution(**merged)
+def better(a: Solution, b: Solution) -> Solution:
+    """The cheaper of two solutions of each problem, with the seconds and iterations of both."""
+    both, swap = b.arrays(), b.cost < a.cost
+    best = Solution(**{name: value.copy() for name, value in a.arrays().items() if name in both})
+    best.put(swap, b[swap])
+    tried = None if a.tried is None or b.tried is None else np.c_[a.tried, b.tried]
+    return replace(best, seconds=a.seconds + b.seconds, iterations=a.iterations + b.iterations, tried=tried)
 
 
-def _solution(arrays: dict[str, Any]) -> DDPSolution:
+def _solution(arrays: dict[str, Any]) -> Solution:
     """A bank's solutions from their arrays without the messages."""
-    return DDPSolution.of_arrays({**arrays, "message": np.full(len(arrays["cost"]), "converged")})
-
-
-def _plain(solution: DDPSolution) -> DDPSolution:
-    """Without V_xx: a bank may get solutions with and without."""
-    return replace(solution, V_xx=None)
+    return Solution.of_arrays({**arrays, "message": np.full(len(arrays["cost"]), "converged")})

@@ -15,7 +15,7 @@ import os
 import shutil
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -25,14 +25,14 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import KDTree
 from tqdm import tqdm
 
+from nocl.data import Solution, hits
 from nocl.judge import dynamics_function
 from nocl.ocp import OCP
 from nocl.sampling import Seed
 from nocl.solvers.ddp.bank import SolutionBank, spread
 from nocl.solvers.ddp.batch import bytes_each
-from nocl.solvers.ddp.solver import DDP, DDPSolution
+from nocl.solvers.ddp.solver import DDP
 from nocl.solvers.nmpc.guesses import mirrored, mirrors
-from nocl.solvers.nmpc.search import SAME, TINY, distinct
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
@@ -50,25 +50,14 @@ LATEST = 0.7  # of the horizon: until when a solution that passes by is of use
 NODES = 200_000  # of solutions, at most, that are looked at for passing by
 NEAR = 8  # ... of which that many, the nearest, are drawn from
 NEWTON = 30  # steps to an equilibrium
-MESSAGE = "<U80"  # room for any message
 CHECKPOINT = "search.safetensors"
 BYTES = 2**31  # guesses and answers that are held at a time, beside the best
 
 
-@dataclass(frozen=True, eq=False)
-class GlobalSolution:
-    """The best solution found of each problem, and how sure that is."""
-
-    best: DDPSolution
-    starts: Rows  # [B], starts tried in all
-    hits: Rows  # [B], how many of them ended at the best cost
-    optima: list[Array]  # [B] of [n, 2]: the costs that starts ended at (SAME apart), rising, and how many did
-
-
 def solve_globally(ddp: DDP, x0: ArrayLike, *, starts: int = 16, neighbours: int = 4, rounds: int = 8, seed: Seed = 0,
-                   known: DDPSolution | None = None, workers: int | str = "auto",
+                   known: Solution | None = None, workers: int | str = "auto",
                    out: str | os.PathLike[str] | None = None, progress: bool | None = None,
-                   report: Report = lambda _: None) -> GlobalSolution:
+                   report: Report = lambda _: None) -> Solution:
     """Solve each problem from cold starts, then from its neighbours' solutions until nothing improves.
 
     Neighbours alone come to rest where a whole region shares a wrong basin: a random half of the states gets one more
@@ -84,7 +73,8 @@ def solve_globally(ddp: DDP, x0: ArrayLike, *, starts: int = 16, neighbours: int
     out : a folder that gets what was found after each stage, and each piece of the stage under way: the same call, with
         the same integer seed, goes on from there
 
-    Raises ValueError for wrong input; a state for which nothing converged has success False in `best`.
+    Returns the best found of each problem; `tried`, `starts`, `hits` and `optima` say how sure that is. Raises
+    ValueError for wrong input; a state for which nothing converged has success False.
     """
     rows, _ = checks.states(x0, ddp.ocp.system.nx, ddp.ocp.system.name)
     if min(starts + (known is not None), neighbours + 1, rounds + 1) < 1:
@@ -104,7 +94,7 @@ def clean(ddp: DDP, bank: SolutionBank, **options: Any) -> SolutionBank:
     """A bank whose solutions were solved again from each other's until nothing improves; options of solve_globally."""
     known = bank.solution
     found = solve_globally(ddp, known.x[:, 0], **{"starts": 0, **options}, known=known)
-    return SolutionBank.of(ddp, found.best)
+    return SolutionBank.of(ddp, found)
 
 
 @dataclass(frozen=True)
@@ -116,12 +106,7 @@ class GlobalDDP:
     seed: int = 0
 
     def solve(self, x0: ArrayLike, workers: int | str = "auto", out: str | os.PathLike[str] | None = None,
-              progress: bool | None = None) -> DDPSolution:
-        return self.search(x0, workers, out, progress).best
-
-    def search(self, x0: ArrayLike, workers: int | str = "auto", out: str | os.PathLike[str] | None = None,
-               progress: bool | None = None) -> GlobalSolution:
-        """The same with all that was found."""
+              progress: bool | None = None) -> Solution:
         return solve_globally(self.ddp, x0, starts=self.starts, seed=self.seed, workers=workers, out=out,
                               progress=progress)
 
@@ -134,7 +119,7 @@ def global_ddp(ocp: OCP, intervals: int, seed: int) -> GlobalDDP:
 class _Search:
     """The best of all that was tried from each state, and the costs at which each start ended."""
 
-    def __init__(self, ddp: DDP, x0: Array, seed: Seed, known: DDPSolution | None, plan: tuple[int, int, int],
+    def __init__(self, ddp: DDP, x0: Array, seed: Seed, known: Solution | None, plan: tuple[int, int, int],
                  workers: int | str, out: str | os.PathLike[str] | None, progress: bool | None, report: Report) -> None:
         self.ddp, self.x0, self.workers, self.report = ddp, x0, workers, report
         self.show = sys.stderr.isatty() if progress is None else progress
@@ -145,7 +130,9 @@ class _Search:
         self.improving = True  # whether the last stage found anything
         self.folder = None if out is None else Path(out)
         self.key = fingerprint(ddp.key, x0, self.seed, plan, *([] if known is None else [known.u])) if out else ""
-        self.best = _nothing(ddp, x0)
+        t = np.tile(np.linspace(0, ddp.ocp.horizon, ddp.intervals + 1), (len(x0), 1))
+        self.best = Solution.blank(t, x0.shape[1], ddp.ocp.system.nu)
+        self.seconds, self.iterations = np.zeros(len(x0)), np.zeros(len(x0), dtype=np.int64)
         if known is not None:
             self._merge(np.arange(len(x0)), known)
         self.near: tuple[Rows, Rows, Array] | None = None  # each state's neighbours: state, image, cost when tried
@@ -232,12 +219,11 @@ class _Search:
 
     def doubtful(self) -> Rows:
         """A random SHARE of the states, and those whose best was found less than twice."""
-        _, table = self._table()
-        return np.flatnonzero((self.rng.random(len(self.x0)) < SHARE) | (_hits(table, self.best.cost) < 2))
+        seldom = hits(self._tried(), self.best.cost) < 2
+        return np.flatnonzero((self.rng.random(len(self.x0)) < SHARE) | seldom)
 
-    def solution(self) -> GlobalSolution:
-        starts, table = self._table()
-        return GlobalSolution(self.best, starts, _hits(table, self.best.cost), [distinct(row) for row in table])
+    def solution(self) -> Solution:
+        return replace(self.best, seconds=self.seconds, iterations=self.iterations, tried=self._tried())
 
     def _neighbours(self, scale: Array, count: int) -> tuple[Rows, Rows, Array]:
         state, image = nearest(self.x0, scale, self._images(), count + 1)
@@ -271,24 +257,24 @@ class _Search:
                                                  progress=self.show and len(rows) <= n))
                 bar.update(len(part))
 
-    def _merge(self, rows: Rows, found: DDPSolution) -> None:
+    def _merge(self, rows: Rows, found: Solution) -> None:
         self.owners.append(rows)
         self.costs.append(found.cost)
-        won = found.cost < self.best.cost[rows]
-        self.best.put(rows[won], found[won])
-        hopeless = rows[~self.best.success[rows]]
-        self.best.message[hopeless] = found.message[~self.best.success[rows]]
+        self.seconds[rows] += found.seconds
+        self.iterations[rows] += found.iterations
+        taken = (found.cost < self.best.cost[rows]) | ~self.best.success[rows]
+        self.best.put(rows[taken], found[taken])
 
-    def _table(self) -> tuple[Rows, Array]:
-        """(starts [B], the cost that each ended at [B, most], inf where there was none)."""
+    def _tried(self) -> Array:
+        """The cost that each start ended at [B, most], NaN where there were fewer."""
         owners = np.concatenate([np.zeros(0, dtype=np.int64), *self.owners])
         costs = np.concatenate([np.zeros(0), *self.costs])
         starts = np.bincount(owners, minlength=len(self.x0))
-        table = np.full((len(self.x0), max(starts, default=0)), np.inf)
+        table = np.full((len(self.x0), max(starts, default=0)), np.nan)
         order = np.argsort(owners, kind="stable")
         column = np.arange(len(owners)) - np.repeat(np.cumsum(starts) - starts, starts)
         table[owners[order], column] = costs[order]
-        return starts, table
+        return table
 
     def _keep(self) -> None:
         """Write what is known after a stage, then drop the stage's pieces."""
@@ -298,7 +284,8 @@ class _Search:
 
         best = {name: value for name, value in self.best.arrays().items() if name != "message"}
         state = {"best": best, "message": self.best.message.tolist(), "near": self.near,
-                 "owners": np.concatenate(self.owners), "costs": np.concatenate(self.costs)}
+                 "owners": np.concatenate(self.owners), "costs": np.concatenate(self.costs),
+                 "seconds": self.seconds, "iterations": self.iterations}
         meta = {"key": self.key, "stages": self.stages, "improving": self.improving}
         store.save_checkpoint(self.folder / CHECKPOINT, state, meta)
         for part in self.folder.glob("stage-*"):
@@ -318,7 +305,8 @@ class _Search:
         if meta.get("key") != self.key:
             raise ValueError(f"{self.folder} holds another search (other states, problem, settings, starts or seed); "
                              "expected the same one, or a new folder: change `out`")
-        self.best = DDPSolution.of_arrays({**state["best"], "message": np.array(state["message"], dtype=MESSAGE)})
+        self.best = Solution.of_arrays({**state["best"], "message": np.array(state["message"])})
+        self.seconds, self.iterations = state["seconds"], state["iterations"]
         self.near, self.owners, self.costs = state["near"], [state["owners"]], [state["costs"]]
         self.done, self.was_improving = meta["stages"], meta["improving"]
 
@@ -401,21 +389,6 @@ def nearest(points: Array, scale: Array, images: list[Array], count: int) -> tup
     return np.take_along_axis(place, order, axis=1), order // count
 
 
-def _nothing(ddp: DDP, x0: Array) -> DDPSolution:
-    """No solution yet of each problem."""
-    B, K, (nx, nu) = len(x0), ddp.intervals, (ddp.ocp.system.nx, ddp.ocp.system.nu)
-    return DDPSolution(
-        np.tile(np.linspace(0, ddp.ocp.horizon, K + 1), (B, 1)), np.repeat(x0[:, None], K + 1, axis=1),
-        np.zeros((B, K, nu)), np.zeros((B, K, nu, nx)), np.zeros((B, K + 1)), np.zeros((B, K + 1, nx)), None,
-        np.full(B, np.inf), np.zeros(B, dtype=bool), np.full(B, "not tried", dtype=MESSAGE),
-        np.zeros(B, dtype=np.int64))
-
-
 def _improved(former: Array, now: Array) -> NDArray[np.bool_]:
     finite = np.where(np.isfinite(former), former, 0.0)
     return np.where(np.isfinite(former), now < finite - IMPROVED * np.abs(finite), np.isfinite(now))
-
-
-def _hits(costs: Array, best: Array) -> Rows:
-    near = costs <= (best + np.maximum(SAME * np.abs(best), TINY))[:, None]
-    return (near & np.isfinite(costs)).sum(axis=1)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -22,8 +23,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from nocl.data import Solution
 from nocl.ocp import OCP
-from nocl.solvers.ddp.batch import Batch, DDPSolution, Job, Rows, assembled, pieces
+from nocl.solvers.ddp.batch import Batch, Job, Rows, assembled, pieces
 from nocl.solvers.ddp.kernel import ddp_source, pack_weights
 from nocl.solvers.ddp.without_compiler import ddp_kernel
 from nocl.support import checks
@@ -97,7 +99,7 @@ class DDP:
 
     def solve(self, x0: ArrayLike, t0: ArrayLike = 0.0, *, u: Array | None = None, x: Array | None = None,
               gain: Array | None = None, curvature: bool = False, workers: int | str = "auto",
-              out: str | os.PathLike[str] | None = None, progress: bool | None = None) -> DDPSolution:
+              out: str | os.PathLike[str] | None = None, progress: bool | None = None) -> Solution:
         """Descend from a guess u [B, K, nu] (default u*), followed with u + gain (x' - x) where x and gain are given.
 
         Parameters
@@ -123,7 +125,7 @@ class DDP:
         tasks = pieces(self, rows, times, guess, curvature)
         return assembled(len(rows), stream(Job(here), tasks, pool, journal, show, f"DDP, {self.ocp.system.name}"))
 
-    def descend(self, batch: Batch) -> DDPSolution:
+    def descend(self, batch: Batch) -> Solution:
         """Solve one piece of a batch, here."""
         work = _Work(self, batch.x0, batch.t0, *(batch.guess.get(name) for name in ("u", "x", "gain")))
         work.descend()
@@ -202,6 +204,7 @@ class _Work:
     mu: Array = field(init=False)
 
     def __post_init__(self) -> None:
+        self.begin = time.perf_counter()
         ocp, B, K = self.ddp.ocp, len(self.x0), self.ddp.intervals
         nx, nu = ocp.system.nx, ocp.system.nu
         self.h = (ocp.horizon - self.t0) / K
@@ -292,7 +295,7 @@ class _Work:
         mu = self.mu[rows] / DECAY
         self.mu[rows] = np.where(mu < self.ddp.settings.damping, 0.0, mu)
 
-    def solution(self, curvature: bool) -> DDPSolution:
+    def solution(self, curvature: bool) -> Solution:
         B, K = len(self.x0), self.ddp.intervals
         nx = self.x.shape[2]
         V, V_x = np.zeros((B, K + 1)), np.zeros((B, K + 1, nx))
@@ -301,8 +304,9 @@ class _Work:
         self._backward(np.arange(B), V, V_x, V_xx)
         success = self.state == CONVERGED
         t = self.t0[:, None] + self.h[:, None] * np.arange(K + 1)
-        return DDPSolution(t, self.x, self.u, self.gain, V, V_x, V_xx, np.where(success, self.J, np.inf), success,
-                           np.array(MESSAGES)[self.state], self.iterations)
+        seconds = np.full(B, (time.perf_counter() - self.begin) / max(B, 1))
+        return Solution(t, self.x, self.u, self.gain, V, V_x, np.where(success, self.J, np.inf), success,
+                        np.array(MESSAGES)[self.state], seconds, self.iterations, V_xx)
 
 
 MESSAGES = ("running", "converged", "stopped at max_iterations", "no descent: the largest damping did not help",

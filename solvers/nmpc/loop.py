@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from nocl.data import Solution, Trajectory
 from nocl.ocp import OCP
@@ -99,33 +99,19 @@ class Loop:
         failed = np.flatnonzero(~np.asarray(solution.success, dtype=bool))
         if warm and failed.size:
             again = self.nmpc.solve(x[failed], nodes=nodes, workers=1, progress=False)
-            solution = _put(solution, again, failed)
+            solution.put(failed, replace(again, seconds=again.seconds + solution.seconds[failed],
+                                         iterations=again.iterations + solution.iterations[failed]))
         success = np.asarray(solution.success)
         source = np.where(success, "solved", "last plan" if warm else "u*")
         self.stats.append({"t": t, "success": success, "seconds": solution.seconds, "cost": solution.cost,
                            "iterations": solution.iterations, "message": solution.message, "source": source})
         ok = success[:, None, None]
-        held = Trajectory(solution.t, np.where(ok, solution.x, guess[0]), np.where(ok, solution.u, guess[1]))
-        return replace(solution, trajectory=held)
+        return replace(solution, x=np.where(ok, solution.x, guess[0]), u=np.where(ok, solution.u, guess[1]))
 
 
 def shifted(last: Solution, x: Array, nodes: Array) -> tuple[Array, Array]:
     """The last plan on new nodes, held on past its end, its states moved to the measured x at the start."""
-    N = last.u.shape[1]
-    held = np.clip(np.searchsorted(last.t, (nodes[:-1] + nodes[1:]) / 2, side="right") - 1, 0, N - 1)
-    states = np.stack([np.stack([np.interp(nodes, last.t, column) for column in path.T], axis=1) for path in last.x])
+    t, N = last.t[0], last.u.shape[1]  # all of its rows have the same nodes
+    held = np.clip(np.searchsorted(t, (nodes[:-1] + nodes[1:]) / 2, side="right") - 1, 0, N - 1)
+    states = np.stack([np.stack([np.interp(nodes, t, column) for column in path.T], axis=1) for path in last.x])
     return states + np.linspace(1, 0, len(nodes))[None, :, None] * (x - states[:, 0])[:, None], last.u[:, held]
-
-
-def _put(solution: Solution, again: Solution, rows: NDArray[np.int64]) -> Solution:
-    """`solution` with its rows replaced; seconds and iterations add up."""
-    fields: dict[str, Any] = {}
-    for name in ("cost", "costate", "success", "seconds", "iterations"):
-        fields[name] = np.array(getattr(solution, name))
-        fields[name][rows] = getattr(again, name) + (fields[name][rows] if name in ("seconds", "iterations") else 0)
-    message = list(solution.message)
-    for i, said in zip(rows, again.message, strict=True):
-        message[int(i)] = said
-    x, u = solution.x.copy(), solution.u.copy()
-    x[rows], u[rows] = again.x, again.u
-    return replace(solution, trajectory=Trajectory(solution.t, x, u), message=message, dense=None, **fields)

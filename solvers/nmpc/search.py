@@ -8,14 +8,11 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
+from nocl.data import SAME, TINY
 from nocl.solvers.nmpc.guesses import Guess
 from nocl.solvers.nmpc.transcription import FEASIBLE, NOT_A_NUMBER, STOPPED, Answer, Transcription
 from nocl.support.checks import Array
-
-SAME = 1e-3  # costs closer than this, relative, count as the same optimum
-TINY = 1e-10  # ... and absolute: costs below it are equal
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,16 +90,6 @@ def _second_opinion(program: Transcription, task: Task, answers: Sequence[Answer
     return [replace(answer, message=f"{answer.message}, by IPOPT after fatrop: {best.message}")]
 
 
-def distinct(costs: ArrayLike) -> Array:
-    """(cost, how many reached it) of each local optimum among costs, inf where there is none, rising [n, 2]."""
-    found = np.sort(np.asarray(costs, dtype=np.float64))
-    found = found[np.isfinite(found)]
-    if not found.size:
-        return np.zeros((0, 2))
-    first = np.r_[True, np.diff(found) > np.maximum(SAME * np.abs(found[1:]), TINY)]
-    return np.c_[found[first], np.diff(np.r_[np.flatnonzero(first), len(found)])]
-
-
 @dataclass(eq=False)
 class Search:
     """All that was tried from one state, in the order of the tasks."""
@@ -138,11 +125,6 @@ class Search:
             return 0
         near = np.array(self.costs) - self.cost <= max(SAME * abs(self.cost), TINY)
         return int(near.sum())
-
-    @property
-    def optima(self) -> Array:
-        """(cost, starts that found it) of each local optimum found, rising [n, 2]."""
-        return distinct(self.costs)
 
     @property
     def message(self) -> str:

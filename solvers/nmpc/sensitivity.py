@@ -2,7 +2,7 @@
 
 With Q_k(x, u) = the cost of interval k + lambda_{k+1}' F(x, u), the second variation of the discretised problem about
 a solution is a linear-quadratic problem with A_k, B_k = dF, W_k = the exact Hessian of Q_k, controls at their bounds
-held, and active path constraints as equations on dx. Its Riccati recursion gives du_k = -K_k dx_k (the neighbouring
+held, and active path constraints as equations on dx. Its Riccati recursion gives du_k = gain_k dx_k (the neighbouring
 extremal: Bryson, Ho (1975), "Applied Optimal Control", ch. 6) and d2J*/dx_k2; equations on the state are carried
 backwards as in Laine, Tomlin (2019), "Efficient computation of feedback control for equality-constrained LQR".
 """
@@ -69,6 +69,12 @@ def derivatives(program: Transcription) -> Derivatives:
     return Derivatives(program)
 
 
+def cost_to_go(program: Transcription, t: Array, x: Array, u: Array) -> Array:
+    """V [N+1] at the nodes t of x [N+1, nx], u [N, nu]."""
+    stages = program.step(x[:-1].T, u.T, np.diff(t)[None])[1].full().ravel()
+    return np.cumsum(np.r_[float(program.end_cost(x[-1], t[-1])), stages[::-1]])[::-1]
+
+
 def dense(program: Transcription, t: Array, x: Array, u: Array, costate: Array) -> Array:
     """(x, costate) at both ends of each interval and their time derivatives [N, 4, 2 nx]: start, end, slopes."""
     d, h = derivatives(program), np.diff(t)[None]
@@ -79,7 +85,7 @@ def dense(program: Transcription, t: Array, x: Array, u: Array, costate: Array) 
 
 
 def second_variation(program: Transcription, t: Array, x: Array, u: Array, costate: Array) -> tuple[Array, Array]:
-    """(gains [N, nu, nx], Hessians of J* [N+1, nx, nx]); NaN from where the solution is no strict local optimum."""
+    """(gain [N, nu, nx], V_xx [N+1, nx, nx]); NaN from where the solution is no strict local optimum."""
     d, n = derivatives(program), x.shape[1]
     N, m = u.shape
     gradient, F_z, W = (np.moveaxis(v.full().reshape(v.shape[0], N, -1), 1, 0) for v in d.second(
@@ -87,16 +93,16 @@ def second_variation(program: Transcription, t: Array, x: Array, u: Array, costa
     end_gradient, P = (v.full() for v in d.end(x[-1], t[-1]))
     after = np.vstack([gradient[:, :n, 0], end_gradient.T])  # gradient at a node without its own path constraints
     free = _free(program, u, gradient[:, n:, 0])
-    gains, hessians = np.full((N, m, n), np.nan), np.full((N + 1, n, n), np.nan)
-    hessians[N], H = P, np.zeros((0, n))
+    gain, V_xx = np.full((N, m, n), np.nan), np.full((N + 1, n, n), np.nan)
+    V_xx[N], H = P, np.zeros((0, n))
     for k in range(N - 1, -1, -1):
         P, H = _with_path(program, x[k + 1], after[k + 1] - costate[k + 1], P, H)
         step = _riccati(F_z[k], W[k], P, H, free[k])
         if step is None:
             break
-        gains[k], P, H = step
-        hessians[k] = P
-    return gains, hessians
+        gain[k], P, H = step
+        V_xx[k] = P
+    return gain, V_xx
 
 
 def _free(program: Transcription, u: Array, gradient: Array) -> NDArray[np.bool_]:
@@ -120,7 +126,7 @@ def _with_path(program: Transcription, x: Array, jump: Array, P: Array, H: Array
 
 
 def _riccati(F_z: Array, W: Array, P: Array, H: Array, free: NDArray[np.bool_]) -> tuple[Array, Array, Array] | None:
-    """(K, P, H) one interval earlier, or None where the free controls have a direction without curvature."""
+    """(gain, P, H) one interval earlier, or None where the free controls have a direction without curvature."""
     n = len(P)
     A, B = F_z[:, :n], F_z[:, n:][:, free]
     P_xx, P_ux = W[:n, :n] + A.T @ P @ A, W[n:, :n][free] + B.T @ P @ A
@@ -130,20 +136,20 @@ def _riccati(F_z: Array, W: Array, P: Array, H: Array, free: NDArray[np.bool_]) 
     if Z.shape[1]:
         if np.linalg.eigvalsh(curvature)[0] <= ROUNDING * max(1.0, np.abs(P_uu).max()):
             return None
-        K = K + Z @ np.linalg.solve(curvature, Z.T @ (P_ux - P_uu @ K))
-    P = P_xx - P_ux.T @ K - K.T @ P_ux + K.T @ P_uu @ K
+        K = K - Z @ np.linalg.solve(curvature, Z.T @ (P_ux + P_uu @ K))
+    P = P_xx + P_ux.T @ K + K.T @ P_ux + K.T @ P_uu @ K
     full = np.zeros((len(free), n))
     full[free] = K
     return full, (P + P.T) / 2, H
 
 
 def _on_equations(M: Array, B: Array) -> tuple[Array, Array, Array]:
-    """M dx + B du = 0 as du = -K dx + Z w, and the equations [r, nx] left for dx alone."""
+    """M dx + B du = 0 as du = K dx + Z w, and the equations [r, nx] left for dx alone."""
     if not B.size:
         return np.zeros((B.shape[1], M.shape[1])), np.eye(B.shape[1]), _independent(M)
     U, s, Vt = np.linalg.svd(B)
     r = int((s > RANK * max(1.0, s[0])).sum())
-    K = Vt[:r].T @ (U[:, :r].T @ M / s[:r, None])
+    K = -Vt[:r].T @ (U[:, :r].T @ M / s[:r, None])
     return K, Vt[r:].T, _independent(U[:, r:].T @ M)
 
 

@@ -15,15 +15,15 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nocl.data import Solution, Trajectory
+from nocl.data import TINY, Solution, Trajectory
 from nocl.judge import check_made_for, dynamics_function
 from nocl.ocp import OCP
 from nocl.solvers.lqr import LQR
 from nocl.solvers.nmpc import guesses as starting
 from nocl.solvers.nmpc.guesses import Guess
 from nocl.solvers.nmpc.loop import Loop
-from nocl.solvers.nmpc.search import TINY, Outcome, Search, Task, attempt
-from nocl.solvers.nmpc.sensitivity import dense, second_variation
+from nocl.solvers.nmpc.search import Outcome, Search, Task, attempt
+from nocl.solvers.nmpc.sensitivity import cost_to_go, dense, second_variation
 from nocl.solvers.nmpc.transcription import BACKENDS, Transcription
 from nocl.support import checks, compiler
 from nocl.support.checks import Array
@@ -139,7 +139,7 @@ class NMPC:
             [B, N, nu], (x [B, N+1, nx], u), a controller (x, t) -> u whose rollout is meant, or a list of them
         nodes : times of the nodes [N+1]; default: N equal intervals from t0 to the window's end
         starts : built-in starts for each state; default: self.starts, or none where guesses are given
-        gains : also the Solution's `gains` and `hessian`
+        gains : also the Solution's `gain` and `V_xx`
         workers : 1, a number of processes, "auto": processes where the measured cost of the first states says that
             they pay; or "tcp://...", a Dask scheduler
         out : a folder that gets each state's outcome as soon as it is there: the same call resumes what is there
@@ -172,19 +172,19 @@ class NMPC:
         return self.with_gains(solution) if gains else solution
 
     def with_gains(self, solution: Solution) -> Solution:
-        """A Solution of this NMPC with its feedback gains du_k = -gains_k dx_k and the Hessians of J* at the nodes.
+        """A Solution of this NMPC with its feedback `gain` and `V_xx`.
 
         By a Riccati recursion with the exact second derivatives of the discretised problem; controls at a bound keep
-        it (zero gains) and active path constraints stay active.
+        it (zero gain) and active path constraints stay active.
         """
         B, (N, nx, nu) = len(solution.x), (self.intervals, self.ocp.system.nx, self.ocp.system.nu)
         if solution.u.shape != (B, N, nu):
             raise ValueError(f"the solution's u has shape {solution.u.shape}; expected [B, {N}, {nu}], of this NMPC")
-        gains, hessian = np.full((B, N, nu, nx), np.nan), np.full((B, N + 1, nx, nx), np.nan)
+        gain, V_xx = np.full((B, N, nu, nx), np.nan), np.full((B, N + 1, nx, nx), np.nan)
         for i in np.flatnonzero(solution.success):
-            gains[i], hessian[i] = second_variation(self.program, solution.t, solution.x[i], solution.u[i],
-                                                    solution.costate[i])
-        return replace(solution, gains=gains, hessian=hessian)
+            gain[i], V_xx[i] = second_variation(self.program, solution.t[i], solution.x[i], solution.u[i],
+                                                solution.V_x[i])
+        return replace(solution, gain=gain, V_xx=V_xx)
 
     def controller(self, hold: int | None = None, receding: bool = False) -> Loop:
         """Closed loop u(x, t), solved again at each call from the shifted last plan.
@@ -346,18 +346,18 @@ def _collect(searches: list[Search], t: Array) -> Solution:
     """One row for each search; NaN where there is no solution."""
     p = searches[0].program
     s, N, B = p.ocp.system, p.N, len(searches)
-    x, u = np.full((B, N + 1, s.nx), np.nan), np.full((B, N, s.nu), np.nan)
-    costate, between = np.full((B, N + 1, s.nx), np.nan), np.full((B, N, 4, 2 * s.nx), np.nan)
+    tried = np.full((B, max(len(search.costs) for search in searches)), np.nan)
+    blank, between = Solution.blank(np.tile(t, (B, 1)), s.nx, s.nu), np.full((B, N, 4, 2 * s.nx), np.nan)
     for i, search in enumerate(searches):
+        tried[i, :len(search.costs)] = search.costs
         if search.best is not None:
-            x[i], u[i], costate[i] = search.best.x, search.best.u, search.best.costate
-            between[i] = dense(p, t, x[i], u[i], costate[i])
-    return Solution(
-        Trajectory(t, x, u), cost=np.array([e.cost for e in searches]), costate=costate,
-        success=np.array([e.best is not None for e in searches]), message=[e.message for e in searches],
-        seconds=np.array([e.seconds for e in searches]), iterations=np.array([e.iterations for e in searches]),
-        starts=np.array([len(e.costs) for e in searches]), hits=np.array([e.hits for e in searches]),
-        optima=[e.optima for e in searches], dense=between)
+            x, u, V_x = blank.x[i], blank.u[i], blank.V_x[i]
+            x[:], u[:], V_x[:] = search.best.x, search.best.u, search.best.costate
+            blank.V[i], between[i] = cost_to_go(p, t, x, u), dense(p, t, x, u, V_x)
+    return replace(
+        blank, cost=np.array([e.cost for e in searches]), success=np.array([e.best is not None for e in searches]),
+        message=np.array([e.message for e in searches]), seconds=np.array([e.seconds for e in searches]),
+        iterations=np.array([e.iterations for e in searches]), tried=tried, dense=between)
 
 
 def _is_solution(guess: Any) -> bool:
