@@ -50,7 +50,7 @@ class Judgement:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Some states of one run; a task of nocl.solvers.pool."""
+    """Some states of one run; a task of nocl.support.pool."""
 
     name: str
     run: int

@@ -9,7 +9,7 @@ import nocl
 from nocl.solvers.ddp import without_compiler
 from nocl.solvers.ddp.solver import DDP
 from nocl.solvers.ddp.without_compiler import NumpyKernel
-from tests.test_ddp import random_model
+from test_ddp import random_model
 
 FIELDS = ("cost", "x", "u", "gain", "V", "V_x", "V_xx", "success", "message", "iterations")
 

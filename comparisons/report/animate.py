@@ -33,7 +33,7 @@ def animate(report: Results, state: int | None = None, methods: Sequence[str] | 
     state : which initial state; default: the one with the median gap
     methods : names; default: the first two that are no reference
     draw : (ax, ocp, visited [n, nx]) -> frame, frame(x so far [k, nx], u [nu], t) -> artists; default: the system's own
-        (nocl.comparisons.drawings), a phase portrait for systems that do not come with nocl
+        (nocl.comparisons.report.drawings), a phase portrait for systems that do not come with nocl
 
     Raises ValueError for names or states that are not in the report, or where no run can be shown.
     """

@@ -326,7 +326,7 @@ def _constant(size: Array) -> Callable[[Array], Array]:
 def read(z: Array, value: Array, gradient: Array, box: Box, *, features: bool = True) -> Structure:
     """The structure that given labels show: rows z [N, nz], f [N, nx], df/dz [N, nx, nz]; constant slopes, polynomials.
 
-    What is affine in the controls cannot be told from scattered samples; see nocl.sysid_affine.
+    What is affine in the controls cannot be told from scattered samples; see nocl.sysid.affine.
     """
     split = Split(box, (), np.zeros(0), np.zeros(0))
     tolerance = TOLERANCE * split.scale(value)[:, None]

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import ast
 import math
-import re
 from pathlib import Path
 
 import pytest
 from processes import python, run, table
 
 VIEW = Path(__file__).parent / "users_view.py"
-README = Path(__file__).parents[2] / "README.md"
 pytestmark = pytest.mark.xdist_group("users_view")  # one run of the lines for all tests of this file
 
 AFTER = f"""
@@ -62,12 +59,6 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def facts(folder):
     return python(AFTER, folder)
-
-
-def test_the_readme_shows_these_lines():
-    shown = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)[0]
-    lines = ast.parse(VIEW.read_text())
-    assert ast.dump(ast.parse(shown)) == ast.dump(ast.Module(lines.body[1:], []))  # but for the docstring
 
 
 def test_shapes_and_names_are_those_that_are_promised(facts):
