@@ -60,7 +60,7 @@ if TYPE_CHECKING:
 
 __all__ = ["TrainSettings", "train"]
 CHECKPOINT = "training.safetensors"
-VALUE_LARGE = 0.05  # mean |V - J*| / J* that is told
+VALUE_LARGE = 0.05  # mean |V - J*| / J* that a warning is given above
 VALUE_HELD_OUT = 16  # times held_out: a mean of relative errors hangs on the few states that are hard
 LOSSES = 40  # of each regression that the card keeps
 STREAM = 0x6E6F636C  # training's own random numbers: never those of initial_states.sample(n, seed), whatever the seeds
@@ -264,7 +264,7 @@ class _Training:
         return net
 
     def _value_optima(self) -> dict[str, DDPSolution]:
-        """What V is told by: initial states, states of the tube, and states of kicked rollouts, solved anew; those that
+        """What V is judged on: initial states, states of the tube, and states of kicked rollouts, solved anew; those that
         can hold the path constraints, where there are any."""
         s, rng = self.settings, self._rng(3_000_000)
         solvers, n = (self.ddp, self.fine, self.bank), VALUE_HELD_OUT * s.held_out

@@ -102,8 +102,8 @@ def value_loss(net: FeatureNet, labels: ValueLabels, scale: Array, slope_weight:
                compiled: bool = True) -> Loss:
     """Mean norm of the relative errors of V - floor and of its gradient, states in units of `scale` [nx].
 
-    Relative, because V and its gradient differ by orders of magnitude between the start and the end of a horizon. In C,
-    or in torch where it is not to be `compiled` or there is no C compiler, which is told: the same to rounding.
+    Relative, because V and its gradient differ by orders of magnitude between the start and the end of a horizon. In C;
+    in torch without `compiled`, or (with a warning) without a C compiler: the same to rounding.
     """
     kind, (floor, unit) = next(net.parameters()).dtype, _units(net)
     phi, slope, rows_of, columns = _features_and_slopes(net, labels, scale)
