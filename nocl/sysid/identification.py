@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 __all__ = ["LearnedDynamics", "LogSettings", "PaperSettings", "Score", "Settings", "identify"]
 
-METHODS = ("default", "mlp", "paper")
+RECIPES = ("default", "mlp", "paper")
 KIND = "dynamics"
 
 
@@ -101,7 +101,7 @@ class LearnedDynamics:
     def outside(self, x: ArrayLike, what: str | None = None) -> Any:
         """Which states [N, nx] the model was not taught about, [N] bool; a UserWarning names `what`, where given.
 
-        For a model of a log, what is far from all logged states (nocl.sysid.logs.coverage); else, what is outside the box X.
+        For a model of a log, what is far from all logged states (nocl.sysid.logs.coverage); else, what is outside X.
         """
         if self.coverage is not None:
             return self.coverage.outside(x) if what is None else self.coverage.warn(x, what)
@@ -270,8 +270,8 @@ def _check_arguments(system: System, method: str, settings: Settings | PaperSett
     if not isinstance(system, System):
         raise ValueError(f"identify: system is a {type(system).__name__}; expected a nocl.System: "
                          "of an OCP, pass ocp.system")
-    if method not in METHODS:
-        raise ValueError(f"identify: method is {method!r}; expected one of {', '.join(METHODS)}")
+    if method not in RECIPES:
+        raise ValueError(f"identify: method is {method!r}; expected one of {', '.join(RECIPES)}")
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise ValueError(f"identify: seed is {seed!r}; expected an integer >= 0")
     if isinstance(data, Log) and method != "default":
