@@ -1,5 +1,6 @@
 # make demo   sets up .venv and runs the main job on cart-pole, ending with the report
 # make test   sets up .venv, lints and tests; make test-slow also runs the tests of minutes
+# make mission   what nocl stands by, in processes of their own: the README's lines, the paper's tables, what ships
 # make pretrained   makes the controllers that ship with nocl again
 # Needs Python 3.11, gcc, g++ and make; everything else comes from the package registry.
 
@@ -14,7 +15,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 export PIP_NO_INPUT := 1
 PIP := $(BIN)/python -m pip install --quiet --no-compile# saves half a minute: most modules are never imported
 
-.PHONY: demo pretrained test test-slow lint set-up clean
+.PHONY: demo pretrained test test-slow mission lint set-up clean
 
 demo: set-up
 	$(BIN)/nocl run cartpole --out runs/cartpole
@@ -23,7 +24,10 @@ test: lint
 	$(BIN)/python -m pytest -n auto -m "not slow"
 
 test-slow: lint
-	$(BIN)/python -m pytest -n auto
+	$(BIN)/python -m pytest -n auto -m "not mission"
+
+mission: set-up
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadgroup tests/mission
 
 pretrained: set-up
 	$(BIN)/python benchmarks/controllers.py --seeds 0 --keep nocl/pretrained --results pretrained

@@ -121,7 +121,7 @@ class _Study:
         cold = solve_globally(DDP(self.ocp), self.x0, starts=STARTS, seed=99, progress=self.progress).u
         best = Reference(self.ocp, FINE, [cold, *guesses]).solve(self.x0)
         J = best.cost
-        found = [self.scenario("undisturbed", "Nothing befalls the system.", self.runs, calm, J)]
+        found = [self.scenario("undisturbed", "No disturbance.", self.runs, calm, J)]
         found.append(self.play("noise", f"Each controller reads the state with noise of {_text(s.noise)} (standard "
                                f"deviation, each in its unit), {s.hold} times.", self.held, J, noise=self.noise))
         kicks = tuple((slot * T / SLOTS, dx) for slot, dx in self.kicks)

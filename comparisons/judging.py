@@ -30,7 +30,7 @@ PARTS = 20  # that the states of a run are judged in
 
 @dataclass(frozen=True, eq=False)
 class Disturbance:
-    """What befalls all runs alike; the default is nothing."""
+    """A disturbance that acts on all runs in the same way; the default is none."""
 
     f: ca.Function | None = None  # another plant than the exact one
     kicks: tuple[tuple[float, Array], ...] = ()  # (time, dx [B, nx])
@@ -50,7 +50,7 @@ class Judgement:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Some states of one run; a task of nocl.solvers.pool."""
+    """Some states of one run; a task of nocl.support.pool."""
 
     name: str
     run: int

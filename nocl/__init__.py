@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from nocl.ocp import OCP
 from nocl.sampling import Gaussian, Uniform
 from nocl.smoothness import smooth_abs, smooth_max, split_controls
+from nocl.support.lazy import hand_on
 from nocl.system import System
 
 if TYPE_CHECKING:
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = ["CND", "OCP", "Dataset", "Ensemble", "Gaussian", "LearnedDynamics", "Log", "Solution", "System",
-           "Trajectory", "Uniform", "identify", "load_ocp", "pretrained", "simulate",
-           "smooth_abs", "smooth_max", "split_controls", "to_acados", "to_casadi",
-           "to_control", "to_do_mpc", "to_gymnasium", "to_torch", "train"]
+           "Trajectory", "Uniform", "comparisons", "identify", "load_ocp", "pretrained", "simulate", "smooth_abs",
+           "smooth_max", "solvers", "split_controls", "systems", "to_acados", "to_casadi", "to_control", "to_do_mpc",
+           "to_gymnasium", "to_torch", "train"]
 
 _LAZY = {  # public name -> module: torch and the solvers are imported when first used
     "CND": "nocl.solvers.cnd.controller", "train": "nocl.solvers.cnd.training",
@@ -40,16 +40,4 @@ _LAZY = {  # public name -> module: torch and the solvers are imported when firs
     "to_acados": "nocl.exports.interop", "to_control": "nocl.exports.interop", "to_do_mpc": "nocl.exports.interop",
     "to_gymnasium": "nocl.exports.interop",
 }
-_PACKAGES = ("comparisons", "exports", "solvers", "support", "sysid", "systems", "translate")  # nocl.solvers.NMPC(...)
-
-
-def __getattr__(name: str) -> Any:
-    if name in _PACKAGES:
-        return import_module(f"nocl.{name}")
-    if name not in _LAZY:
-        raise AttributeError(f"module 'nocl' has no attribute {name!r}")
-    return getattr(import_module(_LAZY[name]), name)
-
-
-def __dir__() -> list[str]:
-    return sorted([*__all__, *_PACKAGES])
+__getattr__, __dir__ = hand_on(__name__, _LAZY)

@@ -28,7 +28,7 @@ from nocl.support import checks, interrupt
 from nocl.support.checks import Array
 
 Kicks = Sequence[tuple[float, ArrayLike]]
-METHODS = ("adams", "bdf")  # the second, for stiff loops, where the first gives up; same tolerances
+MULTISTEP = ("adams", "bdf")  # the second, for stiff loops, where the first gives up; same tolerances
 BETWEEN = 8  # times in an interval that path constraints are judged at
 AT_BOUND = 1e-9  # of the width of U: closer than this counts as saturated
 
@@ -320,11 +320,11 @@ class _Segment:
 
     def __init__(self, judge: _Judge, dae: dict[str, Any], a: float, times: Array) -> None:
         self.judge, self.dae, self.a, self.times = judge, dae, float(a), times
-        self.solvers = {METHODS[0]: judge.integrator(dae, times - a, METHODS[0])}
+        self.solvers = {MULTISTEP[0]: judge.integrator(dae, times - a, MULTISTEP[0])}
 
     def run(self, z: Array) -> tuple[Array, float, str]:
         """(z at the times [len(times), nx + 1], integral of ||u||, message)."""
-        for method in METHODS:
+        for method in MULTISTEP:
             if method not in self.solvers:
                 self.solvers[method] = self.judge.integrator(self.dae, self.times - self.a, method)
             path, magnitude = _integrate(self.solvers[method], z, [self.a, 1.0])
@@ -335,7 +335,7 @@ class _Segment:
     def locate(self, z: Array) -> tuple[Array, float, str]:
         """Run again interval by interval, to say where it failed."""
         path = np.full((len(self.times), len(z)), np.nan)
-        steps = [self.judge.integrator(self.dae, np.array([1.0]), method) for method in METHODS]
+        steps = [self.judge.integrator(self.dae, np.array([1.0]), method) for method in MULTISTEP]
         a = self.a
         for k, b in enumerate(self.times):
             ends = (_integrate(step, z, [a, b - a])[0] for step in steps)
@@ -353,7 +353,7 @@ class _Step:
     def __init__(self, judge: _Judge) -> None:
         dae, self.m = judge.held_dae(), judge.between
         grid = np.arange(1, self.m + 1) / self.m
-        self.solvers = [judge.integrator(dae, grid, method) for method in METHODS]
+        self.solvers = [judge.integrator(dae, grid, method) for method in MULTISTEP]
 
     def run(self, z: Array, u: Array, a: float, b: float, message: list[str]) -> Array:
         """Advance the rows of z whose message is empty from time a to b; write a message where one fails.

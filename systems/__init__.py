@@ -18,8 +18,11 @@ from types import ModuleType
 from typing import Any
 
 from nocl.ocp import OCP
+from nocl.support.lazy import hand_on
 
 NAMES = ("cartpole", "acrobot", "quadrotor", "dubins", "pendulum", "double_integrator", "van_der_pol")
+__all__ = ["NAMES", "load_ocp"]
+__getattr__, __dir__ = hand_on(__name__, {})
 _OCP = "ocp = nocl.OCP(...), or a function ocp() that returns one"
 
 

@@ -4,12 +4,12 @@ import warnings
 
 import numpy as np
 import pytest
+from test_ddp import random_model
 
 import nocl
 from nocl.solvers.ddp import without_compiler
 from nocl.solvers.ddp.solver import DDP
 from nocl.solvers.ddp.without_compiler import NumpyKernel
-from tests.test_ddp import random_model
 
 FIELDS = ("cost", "x", "u", "gain", "V", "V_x", "V_xx", "success", "message", "iterations")
 

@@ -22,7 +22,7 @@ import numpy as np
 import nocl
 from nocl.solvers.ddp import kernel
 from nocl.solvers.ddp.solver import DDP, DDPSettings
-from tests.test_ddp import random_model
+from test_ddp import random_model
 cache, name, kind = sys.argv[1:]
 ocp = nocl.load_ocp(name)
 if kind == "looped":
@@ -74,7 +74,7 @@ def libraries() -> str:
 def sanitized(script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
     environment = {**os.environ, "CC": f"gcc {SANITIZERS}", "LD_PRELOAD": libraries(), "OMP_NUM_THREADS": "1",
                    "ASAN_OPTIONS": "detect_leaks=0:halt_on_error=1", "UBSAN_OPTIONS": "halt_on_error=1"}
-    return subprocess.run([sys.executable, "-c", script, *arguments], env=environment, cwd=ROOT, timeout=300,
+    return subprocess.run([sys.executable, "-c", script, *arguments], env=environment, cwd=ROOT / "tests", timeout=300,
                           capture_output=True, text=True, check=False)
 
 

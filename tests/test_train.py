@@ -25,7 +25,7 @@ from nocl.solvers.cnd.labels import (
     policy_controls,
     tube,
 )
-from nocl.solvers.cnd.regress import fit, policy_loss
+from nocl.solvers.cnd.regress import fit_net, policy_loss
 from nocl.solvers.cnd.validate import advice, gap, refined, summary, value_scores
 from nocl.solvers.cnd.value import ROUND, ValueLabels, on_fine_grid, value_loss, value_net, value_tails
 from nocl.solvers.ddp.bank import SolutionBank, extend
@@ -489,7 +489,7 @@ def test_value_regression_on_exact_labels(shift):
     with torch.random.fork_rng():
         torch.manual_seed(0)
         net = value_net(ocp, labels, (24, 24))
-    fit(net, value_loss(net, labels, np.ones(2)), len(labels), iterations=600, batch=512, lr=4e-3, seed=0)
+    fit_net(net, value_loss(net, labels, np.ones(2)), len(labels), iterations=600, batch=512, lr=4e-3, seed=0)
     cnd = nocl.CND(ocp, feedback(ocp), net)
     size = labels.V - min(0.0, labels.V.min())
     error = np.abs(cnd.value(labels.x, labels.t) - labels.V) / (size + 0.1 * np.median(size))
@@ -557,7 +557,8 @@ def test_a_loss_that_is_not_finite_stops_the_fit():
     labels = riccati_labels(10)
     net = value_net(ocp, labels, (4,))
     with pytest.raises(ValueError, match="the loss is nan at iteration 0: lower the learning rate"):
-        fit(net, lambda rows: net.nets[0].body[0].weight.sum() * torch.nan, 10, iterations=3, batch=2, lr=1e-3, seed=0)
+        fit_net(net, lambda rows: net.nets[0].body[0].weight.sum() * torch.nan, 10, iterations=3, batch=2, lr=1e-3,
+                seed=0)
 
 
 def test_training_never_draws_the_states_of_a_sample_with_a_seed(monkeypatch):

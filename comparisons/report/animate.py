@@ -17,7 +17,7 @@ from nocl.comparisons.report.results import REFERENCE, Results, number
 from nocl.comparisons.report.style import COLOURS, STYLE, plain
 from nocl.support.checks import Array
 
-METHODS = 2  # side by side, unless told
+SIDE_BY_SIDE = 2  # methods, unless others are named
 RATE = 15  # frames a second
 LAST = 1000  # ms that the last frame stands
 DPI = 90
@@ -33,7 +33,7 @@ def animate(report: Results, state: int | None = None, methods: Sequence[str] | 
     state : which initial state; default: the one with the median gap
     methods : names; default: the first two that are no reference
     draw : (ax, ocp, visited [n, nx]) -> frame, frame(x so far [k, nx], u [nu], t) -> artists; default: the system's own
-        (nocl.comparisons.drawings), a phase portrait for systems that do not come with nocl
+        (nocl.comparisons.report.drawings), a phase portrait for systems that do not come with nocl
 
     Raises ValueError for names or states that are not in the report, or where no run can be shown.
     """
@@ -60,7 +60,7 @@ def _chosen(report: Results, methods: Sequence[str] | None) -> list[int]:
     names = [j.name for j in report.judged]
     if methods is None:
         own = [m for m, name in enumerate(names) if name != REFERENCE] or list(range(len(names)))
-        return own[:METHODS]
+        return own[:SIDE_BY_SIDE]
     for name in methods:
         if name not in names:
             raise ValueError(f"there is no method {name!r} in the report; expected some of {', '.join(names)}")

@@ -33,7 +33,7 @@ class Report(Results):
         Parameters
         ----------
         animation : whether to make animation.gif, of the first two methods side by side; default: up to 200 states
-        draw : how the system is drawn there: see nocl.comparisons.animate
+        draw : how the system is drawn there: see nocl.comparisons.report.animate
         """
         from nocl.comparisons.report.files import write_report  # matplotlib is imported where pictures are drawn
 

@@ -418,7 +418,14 @@ each header says which, with their bounds.
   -ffunction-sections -fstack-usage -c NAME.c`, link with `-Wl,--gc-sections -lm`. A processor with single-precision
   floating point wants code that was written with dtype="float32", and `-fsingle-precision-constant`. The workspace
   is on the stack: the `.su` file tells how much.
-- From Python: `nocl.exports.c_code.load(folder, "NAME")` compiles it and returns a callable.
+
+From Python, in this folder:
+
+```python
+import nocl
+
+{called} = nocl.exports.c_code.load(".", "{first}")    # compiled now; takes and gives [n], or rows [B, n]
+```
 """
 
 
@@ -429,7 +436,9 @@ def _readme(folder: Path, header: str, name: str) -> str:
     for stem, text in sorted((headers | {name: header}).items()):
         if MARK in text.split("\n", 1)[0] and (declared := re.search(r"^int \w+\(.*\);$", text, re.MULTILINE)):
             lines[stem] = f"- `{stem}.h`: `{declared[0]}`"
-    return README.format(mark=MARK, names=", ".join(lines), list="\n".join(lines.values()))
+    first = next(iter(lines))
+    return README.format(mark=MARK, names=", ".join(lines), list="\n".join(lines.values()), first=first,
+                         called=first.rpartition("_")[2])
 
 
 def _put(folder: Path, files: Mapping[str, str]) -> Path:

@@ -17,7 +17,7 @@ from scipy.linalg.blas import ssyrk
 from torch import Tensor
 
 Weights = list[Tensor]  # W1, W2, W3
-Report = Callable[[float], None]  # called once a step with the root mean square of the scaled residuals
+OnStep = Callable[[float], None]  # called once a step with the root mean square of the scaled residuals
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,7 +147,7 @@ def loss(weights: Sequence[Tensor], batch: Batch, scale: Tensor) -> Tensor:
 Draw = Callable[[int], tuple[Batch, Tensor]]  # batch size -> a fresh batch and the scale of its residuals
 
 
-def soap(weights: Weights, draw: Draw, *, iterations: int, batch: int, lr: float, report: Report) -> Weights:
+def soap(weights: Weights, draw: Draw, *, iterations: int, batch: int, lr: float, report: OnStep) -> Weights:
     """Adam in Shampoo's eigenbases (Vyas et al. 2024), cosine schedule with 50 steps of warm-up; new weights."""
     own = [w.detach().clone().requires_grad_() for w in weights]
 
@@ -159,7 +159,7 @@ def soap(weights: Weights, draw: Draw, *, iterations: int, batch: int, lr: float
 
 
 def soap_steps(weights: Weights, value_and_gradients: Callable[[], tuple[float, Sequence[Tensor]]], *, iterations: int,
-               lr: float, report: Report) -> Weights:
+               lr: float, report: OnStep) -> Weights:
     """`soap` on the loss and its gradients at these weights, which are changed in place; the result is detached."""
     from pytorch_optimizer import SOAP
 
@@ -180,7 +180,7 @@ def _cosine(progress: float) -> float:
     return 0.5 * (1 + math.cos(math.pi * progress)) + 1e-3
 
 
-def levenberg_marquardt(weights: Weights, draw: Draw, *, steps: int, batch: int, report: Report) -> Weights:
+def levenberg_marquardt(weights: Weights, draw: Draw, *, steps: int, batch: int, report: OnStep) -> Weights:
     """Damped Gauss-Newton steps, all on one batch, each kept only if it lowers the loss; float64 weights.
 
     The damping is in units of the diagonal of J'J: x 0.2 on success, x 4 on failure. Fresh batches would keep it up:

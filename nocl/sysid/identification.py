@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 __all__ = ["LearnedDynamics", "LogSettings", "PaperSettings", "Score", "Settings", "identify"]
 
-METHODS = ("default", "mlp", "paper")
+RECIPES = ("default", "mlp", "paper")
 KIND = "dynamics"
 
 
@@ -93,14 +93,14 @@ class LearnedDynamics:
         return self.system.under(self.to_casadi())
 
     def validate(self, log: Log, steps: Sequence[int] = HORIZONS, *, every: int | None = None) -> Validation:
-        """Errors of simulations of f_theta from a log's states, by number of steps: see nocl.validation."""
+        """Errors of simulations of f_theta from a log's states, by number of steps: see nocl.sysid.logs.validation."""
         log.check(self.system)
         return validate(self.net, log, steps, every, int(self.card.get("settings", {}).get("substeps", 1)))
 
     def outside(self, x: ArrayLike, what: str | None = None) -> Any:
         """Which states [N, nx] the model was not taught about, [N] bool; a UserWarning names `what`, where given.
 
-        For a model of a log, what is far from all logged states (nocl.coverage); else, what is outside the box X.
+        For a model of a log, what is far from all logged states (nocl.sysid.logs.coverage); else, what is outside X.
         """
         if self.coverage is not None:
             return self.coverage.outside(x) if what is None else self.coverage.warn(x, what)
@@ -172,17 +172,18 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
     Parameters
     ----------
     system : System
-        Answers for labels at samples of its box; its equations are never read. With `data`, training takes names, boxes
+        Gives labels at samples of its box: f and its Jacobians, asked at single points. Equations themselves are read
+        only where `known` names rows. With `data`, training takes names, boxes
         and angles from it only, and its equations may be unknown (xdot=None). The score on the card compares with
         them where they are known; for a Log, it is of simulations on that log.
     data : Dataset or Log
         Labels to learn from instead; without Jacobians A, B, from values alone. A Log of trajectories is fitted by its
-        smoothed derivatives, then by simulation error (nocl.sysid_logs).
+        smoothed derivatives, then by simulation error (nocl.sysid.logs).
     known : dict from states to their derivatives (SX, numbers, names of states or controls), or names of states
         Equations that need not be learned; a bare name stands for the system's own equation.
     control_affine : bool
         xdot = a(x) + B(x) u. Labels of f with Jacobians show that by themselves: drawn ones by moving the controls
-        alone, given ones by a trial (nocl.sysid_affine).
+        alone, given ones by a trial (nocl.sysid.affine).
     method : "default", "mlp" or "paper"
         Structure first; one plain sine network; the paper's network, loss and optimiser.
     settings : Settings, (method "paper") PaperSettings or (logs) LogSettings
@@ -268,8 +269,8 @@ def _check_arguments(system: System, method: str, settings: Settings | PaperSett
     if not isinstance(system, System):
         raise ValueError(f"identify: system is a {type(system).__name__}; expected a nocl.System: "
                          "of an OCP, pass ocp.system")
-    if method not in METHODS:
-        raise ValueError(f"identify: method is {method!r}; expected one of {', '.join(METHODS)}")
+    if method not in RECIPES:
+        raise ValueError(f"identify: method is {method!r}; expected one of {', '.join(RECIPES)}")
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise ValueError(f"identify: seed is {seed!r}; expected an integer >= 0")
     if isinstance(data, Log) and method != "default":

@@ -139,7 +139,7 @@ def some_labels(source: Source, n: int, seed: int) -> tuple[Array, Array, Array 
 
 
 @dataclass(frozen=True, eq=False)
-class Pool:
+class LabelPool:
     """What the networks learn from: rows z, and by group labels of its coefficients, or (mixed) of its rows of xdot.
 
     Gradients are by the group's variables, those of mixed labels by its affine controls after them.
@@ -151,7 +151,7 @@ class Pool:
     mixed: bool = False
 
 
-def draw_pool(source: Source, parts: Structure, settings: Settings, rng: np.random.Generator) -> Pool:
+def draw_pool(source: Source, parts: Structure, settings: Settings, rng: np.random.Generator) -> LabelPool:
     """Labels for every group: at fresh uniform samples of the box, or all of the data."""
     if source.data is not None:
         return _given(*source.data, parts)
@@ -160,7 +160,7 @@ def draw_pool(source: Source, parts: Structure, settings: Settings, rng: np.rand
     return labelled(source, parts, z)
 
 
-def _given(z: Array, value: Array, gradient: Array | None, parts: Structure) -> Pool:
+def _given(z: Array, value: Array, gradient: Array | None, parts: Structure) -> LabelPool:
     """Data less what is known: coefficients themselves where each has a row of xdot of its own."""
     symbol = ca.SX.sym("z", parts.split.box.nz)
     known, slope = structures.evaluate(structures.with_jacobian(symbol, [parts.xdot({}, symbol)]), z)
@@ -170,7 +170,7 @@ def _given(z: Array, value: Array, gradient: Array | None, parts: Structure) -> 
         values.append((value - known)[:, rows])
         if gradient is not None:
             slopes.append((gradient[:, rows] - slope[:, rows])[:, :, variables])
-    return Pool(z, values, None if gradient is None else slopes, bool(parts.split.affine))
+    return LabelPool(z, values, None if gradient is None else slopes, bool(parts.split.affine))
 
 
 def rows_of(parts: Structure, settings: Settings) -> int:
@@ -178,18 +178,18 @@ def rows_of(parts: Structure, settings: Settings) -> int:
     return max(settings.samples // parts.cost, MIN_ROWS)
 
 
-def labelled(source: Source, parts: Structure, z: Array) -> Pool:
+def labelled(source: Source, parts: Structure, z: Array) -> LabelPool:
     """The black box's labels at rows z."""
     assert source.oracle is not None
     chunks = ((r, *parts.residual(source.oracle, r)) for r in np.array_split(z, -(-len(z) * parts.cost // CHUNK)))
     return _collect(chunks, parts, source.gradients)
 
 
-def _collect(chunks: Iterable[tuple[Array, Array, Array]], parts: Structure, gradients: bool) -> Pool:
+def _collect(chunks: Iterable[tuple[Array, Array, Array]], parts: Structure, gradients: bool) -> LabelPool:
     rows, values, slopes = [], [], []
     for z, value, gradient in chunks:
         rows.append(z)
         values.append([value[:, g.coefficients] for g in parts.groups])
         slopes.append([gradient[:, g.coefficients][:, :, g.variables] for g in parts.groups] if gradients else [])
     join = [[np.concatenate(part) for part in zip(*pieces, strict=True)] for pieces in (values, slopes)]
-    return Pool(np.concatenate(rows), join[0], join[1] if gradients else None)
+    return LabelPool(np.concatenate(rows), join[0], join[1] if gradients else None)

@@ -14,7 +14,7 @@ from torch import Tensor
 from nocl.nets import MLP, FeatureNet
 from nocl.support.checks import Array
 from nocl.sysid import fitting
-from nocl.sysid.labels import Pool, Source, draw_pool, labelled
+from nocl.sysid.labels import LabelPool, Source, draw_pool, labelled
 from nocl.sysid.plain import train as train_plain
 from nocl.sysid.progress import Checkpoint, Progress
 from nocl.sysid.settings import Budget, Settings
@@ -50,7 +50,7 @@ def fit_groups(source: Source, parts: Structure, settings: Settings, seed: int, 
     return weights
 
 
-def fit_group(parts: Structure, pool: Pool, index: int, settings: Settings, seed: int,
+def fit_group(parts: Structure, pool: LabelPool, index: int, settings: Settings, seed: int,
               bar: Progress, old: fitting.Weights | None = None,
               frequency: list[Tensor] | None = None) -> fitting.Weights:
     """Train one network, from `old` weights without SOAP's large steps; its weights in the units of its labels."""
@@ -160,7 +160,7 @@ def _spread(box: Box) -> Array:
     return box.width / np.sqrt(12)
 
 
-def _samples(parts: Structure, pool: Pool, index: int, angles: bool) -> tuple[fitting.Samples, Array, Array]:
+def _samples(parts: Structure, pool: LabelPool, index: int, angles: bool) -> tuple[fitting.Samples, Array, Array]:
     """(normalised samples of a group, the mean and spread that its network's outputs were normalised by)."""
     box, group, z = parts.split.box, parts.groups[index], ca.SX.sym("z", parts.split.box.nz)
     phi, owner = _features(box, group, z, angles)

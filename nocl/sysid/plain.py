@@ -71,7 +71,7 @@ class Linear:
 
 
 def train(samples: fitting.Samples, budget: Budget, lr: float, weight: float, generator: torch.Generator,
-          report: fitting.Report, frequency: Tensor | None = None,
+          report: fitting.OnStep, frequency: Tensor | None = None,
           old: fitting.Weights | None = None) -> fitting.Weights:
     """Weights of a network whose features are the variables; float64.
 
@@ -107,7 +107,7 @@ def _loss(sizes: list[int], z: Tensor, y: Tensor, dy: Tensor, weight: float) -> 
 
 
 def _soap(weights: fitting.Weights, loss: Loss, n: int, budget: Budget, lr: float, generator: torch.Generator,
-          report: fitting.Report) -> fitting.Weights:
+          report: fitting.OnStep) -> fitting.Weights:
     """fitting.soap's optimiser and schedule, on random batches of n labels."""
     own = [w.float().clone().requires_grad_() for w in weights]
     theta = torch.empty(sum(w.numel() for w in own))

@@ -21,11 +21,11 @@ class Progress:
     def __init__(self, name: str, show: bool) -> None:
         self.name, self.show = name, show
 
-    def stage(self, title: str, total: int) -> _Stage:
-        return _Stage(f"identify {self.name}: {title}", total, self.show and total > 0)
+    def stage(self, title: str, total: int) -> _Bar:
+        return _Bar(f"identify {self.name}: {title}", total, self.show and total > 0)
 
 
-class _Stage:
+class _Bar:
     def __init__(self, title: str, total: int, show: bool) -> None:
         self.bar = tqdm(total=total, desc=title, disable=not show, mininterval=0.5)
 

@@ -37,7 +37,7 @@ from nocl.support.checks import Array
 from nocl.translate.arguments import Arguments
 
 Oracle = Callable[[Array, Array], Dataset]  # x [N, nx], u [N, nu] -> labels with Jacobians
-Labels = Callable[[Array], tuple[Array, Array]]  # z [N, nz] -> values [N, E] and gradients [N, E, nz]
+LabelFunction = Callable[[Array], tuple[Array, Array]]  # z [N, nz] -> values [N, E] and gradients [N, E, nz]
 Draw = Callable[[int], tuple[Array, Array]]  # n -> fresh rows z [n, nz] and their entries [n, E]
 
 TOLERANCE = 1e-9  # of the largest |f_i|: above rounding, far below anything that matters
@@ -147,7 +147,7 @@ class Expansion:
         parts = [_powers(self.box, k, d, z) for k, d in zip(self.variables, self.degrees, strict=True)]
         return [_product(factors) for factors in product(*parts)]
 
-    def labels(self, entries: Labels, z: Array) -> tuple[Array, Array]:
+    def labels(self, entries: LabelFunction, z: Array) -> tuple[Array, Array]:
         """Coefficients [N, n T] and their gradients [N, n T, nz] at rows z, from T labels of the entries a row."""
         axes = [_nodes(self.box, k, d) for k, d in zip(self.variables, self.degrees, strict=True)]
         nodes = np.array(list(product(*axes)))  # [T, |variables|]
@@ -251,7 +251,7 @@ class Structure:
         return self.split.combine(entries, z)
 
 
-def _less(labels: Labels, known: ca.Function) -> Labels:
+def _less(labels: LabelFunction, known: ca.Function) -> LabelFunction:
     """Labels less a known part."""
     def residual(z: Array) -> tuple[Array, Array]:
         (value, gradient), (known_value, slope) = labels(z), evaluate(known, z)
@@ -303,7 +303,7 @@ def find(oracle: Oracle, box: Box, *, seed: int = 0, probes: int = 64, features:
     """
     rng, counter = np.random.default_rng(seed), _Counter(oracle)
     split = affine_split(counter, box, rng, probes)
-    first = _Stage(box, partial(split.labels, counter), split.scale, split.rest, rng, probes)
+    first = _Pass(box, partial(split.labels, counter), split.scale, split.rest, rng, probes)
     known, left = first.exact(features)
     linear = with_jacobian(first.z, known)
     entries, scale = _less(first.labels, linear), first.size()
@@ -316,7 +316,7 @@ def find(oracle: Oracle, box: Box, *, seed: int = 0, probes: int = 64, features:
     for expansion in expansions:
         size = scale[list(expansion.entries)].repeat(expansion.terms)
         rest = tuple(k for k in split.rest if k not in expansion.variables)
-        stage = _Stage(box, partial(expansion.labels, entries), _constant(size), rest, rng, probes, first.z)
+        stage = _Pass(box, partial(expansion.labels, entries), _constant(size), rest, rng, probes, first.z)
         found, variables = stage.exact(features)
         learned |= {len(exact) + c: v for c, v in variables.items()}
         exact += found
@@ -331,7 +331,7 @@ def _constant(size: Array) -> Callable[[Array], Array]:
 def read(z: Array, value: Array, gradient: Array, box: Box, *, features: bool = True) -> Structure:
     """The structure that given labels show: rows z [N, nz], f [N, nx], df/dz [N, nx, nz]; constant slopes, polynomials.
 
-    What is affine in the controls cannot be told from scattered samples; see nocl.sysid_affine.
+    What is affine in the controls cannot be told from scattered samples; see nocl.sysid.affine.
     """
     split = Split(box, (), np.zeros(0), np.zeros(0))
     tolerance = TOLERANCE * split.scale(value)[:, None]
@@ -354,10 +354,10 @@ def read(z: Array, value: Array, gradient: Array, box: Box, *, features: bool = 
     return replace(structure, words=describe(structure))
 
 
-class _Stage:
+class _Pass:
     """Finds what is exact in a family of functions of z that can be labelled anywhere in the box."""
 
-    def __init__(self, box: Box, labels: Labels, scale: Callable[[Array], Array], rest: tuple[int, ...],
+    def __init__(self, box: Box, labels: LabelFunction, scale: Callable[[Array], Array], rest: tuple[int, ...],
                  rng: np.random.Generator, probes: int, z: ca.SX | None = None) -> None:
         self.box, self.labels, self.scale, self.rest, self.rng, self.probes = box, labels, scale, rest, rng, probes
         self.z = ca.SX.sym("z", box.nz) if z is None else z
@@ -400,7 +400,7 @@ def _grouped(variables: Mapping[int, tuple[int, ...]]) -> tuple[Group, ...]:
     return tuple(Group(v, tuple(members)) for v, members in groups.items())
 
 
-def _expansions(box: Box, entries: Labels, scale: Array, variables: Mapping[int, tuple[int, ...]],
+def _expansions(box: Box, entries: LabelFunction, scale: Array, variables: Mapping[int, tuple[int, ...]],
                 rng: np.random.Generator, probes: int) -> tuple[Expansion, ...]:
     """The entries by the variables in which they are polynomials of a low degree."""
     union = sorted({k for v in variables.values() for k in v})
@@ -418,7 +418,7 @@ def _columns(pairs: Sequence[tuple[int, int]]) -> tuple[tuple[int, ...], tuple[i
     return tuple(k for k, _ in pairs), tuple(d for _, d in pairs)
 
 
-def _degrees(box: Box, entries: Labels, scale: Array, k: int, rng: np.random.Generator,
+def _degrees(box: Box, entries: LabelFunction, scale: Array, k: int, rng: np.random.Generator,
              probes: int) -> NDArray[np.int_]:
     """The lowest degree up to 3 of each entry in variable k (angles: 1, in sin and cos); 0 where there is none. [E]"""
     z = box.sample(probes, rng)
@@ -486,8 +486,8 @@ def _moved(z: Array, box: Box, k: int, rng: np.random.Generator) -> Array:
     return moved
 
 
-def _slopes(labels: Labels, scale: Callable[[Array], Array], box: Box, rest: Sequence[int], rng: np.random.Generator,
-            probes: int) -> Array:
+def _slopes(labels: LabelFunction, scale: Callable[[Array], Array], box: Box, rest: Sequence[int],
+            rng: np.random.Generator, probes: int) -> Array:
     """Each function's constant slope in each variable: 0 where it does not enter, NaN where the slope varies. [E, nz]
 
     Both the values under one-at-a-time moves and the gradients must agree, so that steps and dead zones are seen.

@@ -115,7 +115,7 @@ def train_paper(ocp: OCP, dynamics: Any = None, settings: PaperSettings | None =
     trainer = _Trainer(ocp, dynamics, settings, seed, progress, device, dtype)
     named = f"{type(dynamics)}{getattr(dynamics, '__qualname__', '')}"  # of a plain callable its name alone is known
     key = identity(ocp, settings, seed, trainer.f, dtype=str(dtype), dynamics=named)
-    run = _Run.resumed(trainer, checkpoint, key) or _Run.raced(trainer)
+    run = _Training.resumed(trainer, checkpoint, key) or _Training.raced(trainer)
     run.train(callback, None if checkpoint is None else lambda: run.save(checkpoint, key))
     policy, value = run.best.networks(settings)
     card = {"method": "paper", "settings": asdict(settings), "seed": seed, "dtype": str(dtype).removeprefix("torch."),
@@ -212,7 +212,7 @@ class _Best:
         return self.pair
 
 
-class _Run:
+class _Training:
     """The joint training, from the race's winner or from a checkpoint; what it holds is what a checkpoint keeps."""
 
     def __init__(self, trainer: _Trainer, policy: FeatureNet, race: list[float], race_seconds: float) -> None:
@@ -225,7 +225,7 @@ class _Run:
         self.rows: list[list[float]] = []
 
     @classmethod
-    def raced(cls, trainer: _Trainer) -> _Run:
+    def raced(cls, trainer: _Trainer) -> _Training:
         start = time.perf_counter()
         policy, race = trainer.race()
         return cls(trainer, policy, race, time.perf_counter() - start)
@@ -282,7 +282,7 @@ class _Run:
         store.save_checkpoint(path, state, meta)
 
     @classmethod
-    def resumed(cls, trainer: _Trainer, path: Path | None, key: str) -> _Run | None:
+    def resumed(cls, trainer: _Trainer, path: Path | None, key: str) -> _Training | None:
         """The run that a checkpoint of the same call holds; another call's is left aside and overwritten."""
         if path is None or not path.exists():
             return None

@@ -16,12 +16,12 @@ from nocl.ocp import OCP
 from nocl.solvers.cnd.labels import Labels
 from nocl.translate.torch_functions import to_torch
 
-Loss = Callable[[Tensor], Tensor]  # row numbers of the labels -> a scalar
-Report = Callable[[float], Any]  # told the loss of each iteration
+LossFunction = Callable[[Tensor], Tensor]  # row numbers of the labels -> a scalar
+OnStep = Callable[[float], Any]  # called once an iteration with the loss
 
 
-def fit(net: FeatureNet, loss: Loss, rows: int, *, iterations: int, batch: int, lr: float, seed: int,
-        report: Report = lambda _: None) -> None:
+def fit_net(net: FeatureNet, loss: LossFunction, rows: int, *, iterations: int, batch: int, lr: float, seed: int,
+            report: OnStep = lambda _: None) -> None:
     """Train net in place on random batches of row numbers; raises ValueError where the loss is not finite."""
     from pytorch_optimizer import SOAP
 
@@ -45,7 +45,7 @@ def _cosine(progress: float) -> float:
     return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * progress))
 
 
-def policy_loss(ocp: OCP, net: FeatureNet, inverse: ca.Function, labels: Labels) -> Loss:
+def policy_loss(ocp: OCP, net: FeatureNet, inverse: ca.Function, labels: Labels) -> LossFunction:
     """Mean of w (u - u*)' R (u - u*), R from L, w the label's weight: an interval's length over its solution's cost.
 
     For control-affine problems that is the cost lost along the labelled paths, as a share of what they cost. Answers

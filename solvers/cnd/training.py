@@ -33,7 +33,7 @@ from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.features import at_rate, policy_net
 from nocl.solvers.cnd.identity import identity
 from nocl.solvers.cnd.labels import Labels, at_other_rates, tube, visited
-from nocl.solvers.cnd.regress import fit, policy_loss
+from nocl.solvers.cnd.regress import fit_net, policy_loss
 from nocl.solvers.cnd.settings import TrainSettings
 from nocl.solvers.cnd.validate import (
     advice,
@@ -61,7 +61,7 @@ if TYPE_CHECKING:
 
 __all__ = ["TrainSettings", "train"]
 CHECKPOINT = "training.safetensors"
-VALUE_LARGE = 0.05  # mean |V - J*| / J* that is told
+VALUE_LARGE = 0.05  # mean |V - J*| / J* that a warning is given above
 VALUE_HELD_OUT = 16  # times held_out: a mean of relative errors hangs on the few states that are hard
 LOSSES = 40  # of each regression that the card keeps
 STREAM = 0x6E6F636C  # training's own random numbers: never those of initial_states.sample(n, seed), whatever the seeds
@@ -207,8 +207,8 @@ class _Training:
         loss = policy_loss(self.ocp, self.net, self.inverse, self.labels)
         with self._stage(f"round {self.round}: controller", iterations, fits=True) as bar:
             report = _Reporter(bar, iterations)
-            fit(self.net, loss, len(self.labels), iterations=iterations, batch=s.batch, lr=s.lr,
-                seed=self.seed + self.round, report=report)
+            fit_net(self.net, loss, len(self.labels), iterations=iterations, batch=s.batch, lr=s.lr,
+                    seed=self.seed + self.round, report=report)
         self.losses = report.kept
 
     def _validate(self) -> None:
@@ -265,8 +265,8 @@ class _Training:
         return net
 
     def _value_optima(self) -> dict[str, Solution]:
-        """What V is told by: initial states, states of the tube, and states of kicked rollouts, solved anew; those that
-        can hold the path constraints, where there are any."""
+        """What V is judged on: initial states, states of the tube, and states of kicked rollouts, solved anew; where
+        there are path constraints, those that can hold them."""
         s, rng = self.settings, self._rng(3_000_000)
         solvers, n = (self.ddp, self.fine, self.bank), VALUE_HELD_OUT * s.held_out
         with self._stage("held-out states for V", 3) as bar:
@@ -294,8 +294,8 @@ class _Training:
         loss = value_loss(net.float(), labels, self.bank.scale)
         with self._stage("value function" + (", once more" if attempt else ""), iterations, fits=True) as bar:
             report = _Reporter(bar, iterations)
-            fit(net, loss, len(labels), iterations=iterations, batch=s.batch, lr=s.lr, seed=self.seed + attempt,
-                report=report)
+            fit_net(net, loss, len(labels), iterations=iterations, batch=s.batch, lr=s.lr, seed=self.seed + attempt,
+                    report=report)
         return report.kept
 
     def _card(self) -> dict[str, Any]:

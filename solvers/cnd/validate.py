@@ -1,4 +1,4 @@
-"""What training is told by: problems that no label starts from, solved anew on a fine grid."""
+"""Held-out problems that training is judged on: no label starts there, and they are solved anew on a fine grid."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from nocl.ocp import OCP
 from nocl.solvers.cnd.features import features
 from nocl.solvers.cnd.labels import Field, answered, kicked_states, tube_states
 from nocl.solvers.cnd.loss_kernel import ValueKernel
-from nocl.solvers.cnd.regress import Loss
+from nocl.solvers.cnd.regress import LossFunction
 from nocl.solvers.cnd.validate import refined
 from nocl.solvers.ddp.bank import SolutionBank
 from nocl.solvers.ddp.solver import DDP
@@ -101,11 +101,11 @@ def _floor(labels: ValueLabels) -> float:
 
 
 def value_loss(net: FeatureNet, labels: ValueLabels, scale: Array, slope_weight: float = 0.1, *,
-               compiled: bool = True) -> Loss:
+               compiled: bool = True) -> LossFunction:
     """Mean norm of the relative errors of V - floor and of its gradient, states in units of `scale` [nx].
 
-    Relative, because V and its gradient differ by orders of magnitude between the start and the end of a horizon. In C,
-    or in torch where it is not to be `compiled` or there is no C compiler, which is told: the same to rounding.
+    Relative, because V and its gradient differ by orders of magnitude between the start and the end of a horizon. In C;
+    in torch without `compiled`, or (with a warning) without a C compiler: the same to rounding.
     """
     kind, (floor, unit) = next(net.parameters()).dtype, _units(net)
     phi, slope, rows_of, columns = _features_and_slopes(net, labels, scale)

@@ -6,7 +6,7 @@ import numpy as np
 
 from nocl.data import Dataset
 from nocl.support.checks import Array
-from nocl.sysid.logs.log import Log, Run
+from nocl.sysid.logs.log import Log, Recording
 
 
 def noise(log: Log) -> Array:
@@ -20,7 +20,7 @@ def dataset(log: Log) -> Dataset:
     return Dataset(np.concatenate(x), np.concatenate(u), np.concatenate(xdot))
 
 
-def labels(run: Run) -> tuple[Array, Array, Array]:
+def labels(run: Recording) -> tuple[Array, Array, Array]:
     """(x, u, xdot) of one run, a row for each label."""
     if run.xdot is None:
         return run.smooth.middle, run.u, run.smooth.xdot

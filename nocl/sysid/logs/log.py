@@ -26,7 +26,7 @@ LEAST = 5  # samples of a piece: fewer have no smoothed derivative
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class Recording:
     """A recording without gaps in time or control; `run` says which recording it is a piece of."""
 
     run: str
@@ -50,7 +50,7 @@ class Log:
 
     states: tuple[str, ...]
     controls: tuple[str, ...]
-    runs: tuple[Run, ...]
+    runs: tuple[Recording, ...]
     left_out: int = 0  # samples in pieces too short to use
 
     @staticmethod
@@ -138,7 +138,7 @@ class Log:
     def __len__(self) -> int:
         return sum(map(len, self.runs))
 
-    def __iter__(self) -> Iterator[Run]:
+    def __iter__(self) -> Iterator[Recording]:
         return iter(self.runs)
 
     def __repr__(self) -> str:
@@ -172,7 +172,7 @@ def _numbers(column: Any, name: str, path: str | Path) -> Array:
 
 
 def _pieces(system: System, t: Array, arrays: dict[str, Array], labels: Any, max_gap: float,
-            owner: str) -> tuple[list[Run], int]:
+            owner: str) -> tuple[list[Recording], int]:
     """(the pieces without gaps, the number of samples left out)."""
     pieces, left_out = [], 0
     _, first = np.unique(labels, return_index=True)
@@ -203,7 +203,7 @@ def _check_times(t: Array, rows: Any, owner: str) -> None:
                          "expected rising times: sort the samples, or name several recordings by `run`")
 
 
-def _piece(system: System, run: str, t: Array, arrays: dict[str, Array], rows: Any) -> Run | None:
+def _piece(system: System, run: str, t: Array, arrays: dict[str, Array], rows: Any) -> Recording | None:
     """A piece, from its first to its last sample with a whole state; None where too little is left."""
     whole = np.flatnonzero(np.isfinite(arrays["x"][rows]).all(axis=1))
     if not len(whole):
@@ -217,4 +217,4 @@ def _piece(system: System, run: str, t: Array, arrays: dict[str, Array], rows: A
         there = np.isfinite(x[:, i])
         x[there, i] = np.unwrap(x[there, i])
     xdot = arrays["xdot"][rows] if "xdot" in arrays else None
-    return Run(run, t[rows], x, u, xdot)
+    return Recording(run, t[rows], x, u, xdot)

@@ -26,7 +26,7 @@ class Smooth:
 
 
 def smooth(t: Array, x: Array) -> Smooth:
-    """One run, state by state: t [K+1], x [K+1, nx], NaN where a sample is missing. `Run.smooth` keeps the answer."""
+    """State by state: t [K+1], x [K+1, nx], NaN where a sample is missing. `Recording.smooth` keeps the answer."""
     middle = (t[:-1] + t[1:]) / 2
     columns = [_spline(t, x[:, i], middle) for i in range(x.shape[1])]
     states, mid, xdot = (np.column_stack([c[k] for c in columns]) for k in range(3))

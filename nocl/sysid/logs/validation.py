@@ -11,7 +11,7 @@ import torch
 
 from nocl.support.checks import Array
 from nocl.support.threads import one_thread
-from nocl.sysid.logs.log import Log, Run
+from nocl.sysid.logs.log import Log, Recording
 from nocl.translate.rk4 import rk4_interval
 
 if TYPE_CHECKING:
@@ -130,7 +130,7 @@ def _errors(f: Field, log: Log, starts: Sequence[Array], wanted: Sequence[int], 
                      for which in range(3)))
 
 
-def _run_errors(f: Field, run: Run, states: Array, wanted: Sequence[int], stride: int,
+def _run_errors(f: Field, run: Recording, states: Array, wanted: Sequence[int], stride: int,
                 substeps: int) -> dict[int, tuple[Array, Array, Array]]:
     """(errors, moves, times) of one run, by horizon; starts are the whole states among every stride-th."""
     found, h = {}, np.diff(run.t)

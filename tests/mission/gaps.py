@@ -1,0 +1,56 @@
+"""Gaps of the controllers that come with nocl on fixed states: the numbers of tests/data/gaps.json, and how they arise.
+
+    python tests/mission/gaps.py      # measures again and replaces the file: for controllers that were trained anew
+
+J* of a state is the least cost known: DDP's on FINE held controls, from the best of a global search and from what the
+controllers do themselves. It is kept, so that a gap tells of the controller and the judge alone.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+
+import nocl
+from nocl.solvers import DDP, solve_globally
+from nocl.support.checks import Array
+
+FILE = Path(__file__).parents[1] / "data" / "gaps.json"
+PROBLEMS = ("pendulum", "cartpole", "acrobot", "quadrotor", "dubins")
+DYNAMICS = ("exact", "learned")
+STATES, SEED = 10, 2024
+FINE = 320  # intervals
+
+
+def costs(problem: str, dynamics: str, x0: Array) -> Array:
+    """[B], the judge's cost of the shipped controller as continuous feedback from x0 [B, nx]; inf where it failed."""
+    return np.asarray(nocl.simulate(nocl.load_ocp(problem), nocl.pretrained(problem, dynamics), x0).cost)
+
+
+def searched(problem: str, x0: Array) -> Array:
+    """[B], the cost that the global search finds on the usual grid."""
+    return np.asarray(solve_globally(DDP(nocl.load_ocp(problem)), x0, seed=0).best.cost)
+
+
+def optimum(problem: str, x0: Array) -> Array:
+    """[B], J*."""
+    ocp = nocl.load_ocp(problem)
+    coarse, fine = DDP(ocp), DDP(ocp, intervals=FINE)
+    found = solve_globally(coarse, x0, seed=0).best
+    guesses = [np.repeat(found.u, FINE // coarse.intervals, axis=1)]
+    for dynamics in DYNAMICS:
+        guesses.append(nocl.simulate(ocp, nocl.pretrained(problem, dynamics), x0, nodes=FINE + 1).u[:, :-1])
+    return np.min([fine.solve(x0, u=u).cost for u in guesses], axis=0)
+
+
+def measured(problem: str) -> dict[str, object]:
+    x0 = nocl.load_ocp(problem).initial_states.sample(STATES, SEED)
+    best = optimum(problem, x0)
+    gaps = {dynamics: (costs(problem, dynamics, x0) / best - 1).tolist() for dynamics in DYNAMICS}
+    return {"x0": x0.tolist(), "best": best.tolist(), "searched": searched(problem, x0).tolist(), "gap": gaps}
+
+
+if __name__ == "__main__":
+    FILE.write_text(json.dumps({problem: measured(problem) for problem in PROBLEMS}, indent=1) + "\n")
