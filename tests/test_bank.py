@@ -56,7 +56,7 @@ def test_the_best_known_optimum_is_found_where_a_straight_start_misses():
     missed = straight().cost > 1.01 * best_known()
     assert missed.mean() > 0.1
     assert found().success.all()
-    assert (found().cost < 1.001 * best_known()).mean() > 0.95
+    assert (found().cost > 1.001 * best_known()).sum() <= missed.sum() / 4  # none of 24, but basins are chaotic
 
 
 def test_neighbours_improve_what_one_start_found():

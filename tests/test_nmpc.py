@@ -111,7 +111,7 @@ def test_several_starts_find_what_one_misses():
     one, many = (NMPC(ocp, 40, starts=n, passes=0).solve(x0) for n in (1, 8))
     assert many.success.all()
     assert (many.cost <= one.cost + 1e-9).all()
-    assert (many.cost < 0.9 * one.cost).sum() >= 3
+    assert (many.cost < 0.9 * one.cost).any()
     assert (many.starts == 8).all()
     assert ((many.hits >= 1) & (many.hits <= 8)).all()
 

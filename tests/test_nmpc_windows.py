@@ -161,11 +161,14 @@ def test_a_bad_hold_is_refused():
 
 @pytest.mark.parametrize("solver", ["fatrop", "ipopt"])
 def test_a_solution_nearby_is_a_warm_start(solver):
-    """A Solution as a guess takes fewer iterations than its arrays, which are taken for any guess; same optimum."""
+    """A Solution as a guess takes fewer iterations than its arrays, which are taken for any guess; same optimum.
+
+    So near, 0.6 times as many: Newton's steps converge at once, and a cold start brings its barrier down first.
+    """
     ocp = nocl.load_ocp("acrobot")
-    nmpc, x0 = NMPC(ocp, 30, starts=2, passes=0, solver=solver), ocp.initial_states.sample(2, 0)
+    nmpc, x0 = NMPC(ocp, 30, starts=2, passes=0, solver=solver), ocp.initial_states.sample(4, 0)
     solution = nmpc.solve(x0)
-    warm, cold = nmpc.solve(x0 + 0.01, solution), nmpc.solve(x0 + 0.01, (solution.x, solution.u))
+    warm, cold = nmpc.solve(x0 + 1e-3, solution), nmpc.solve(x0 + 1e-3, (solution.x, solution.u))
     assert warm.cost == pytest.approx(cold.cost, rel=1e-7)
     assert warm.u == pytest.approx(cold.u, abs=1e-3)
     assert warm.iterations.sum() < cold.iterations.sum()

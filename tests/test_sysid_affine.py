@@ -216,8 +216,12 @@ def test_what_is_not_affine_is_not():
 
 @pytest.mark.filterwarnings("ignore:identify. the labels speak against:UserWarning")  # too few steps
 def test_the_model_is_saved_and_refined(tmp_path):
+    """Refining goes on from where SOAP ended: from hardly trained weights Levenberg-Marquardt may end anywhere.
+
+    Over five seeds the error falls to 0.8 to 1.8 % of what it was; from 30 steps of SOAP, to 0.1 to 51 %.
+    """
     model = identify(plant(), data=both(plant(), 60)[0], control_affine=True,
-                     settings=dataclasses.replace(SMALL, iterations=30, polish=2), progress=False)
+                     settings=dataclasses.replace(SMALL, polish=2), progress=False)
     model.save(tmp_path)
     loaded = LearnedDynamics.load(tmp_path)
     x, u = np.random.default_rng(0).uniform(-1, 1, (20, 2)), np.random.default_rng(1).uniform(-1, 1, (20, 1))
