@@ -87,7 +87,7 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--known", type=_known, metavar="A=B,C=D", help="with --data: derivatives that are known, "
                      "like p=v,theta=omega: d p/dt = v; a number, or a state's or control's name")
     sub.add_argument("--control-affine", action="store_true", help="with --data: xdot = a(x) + B(x) u")
-    sub.add_argument("--hold-controls", action="store_true", help="with --data: an empty control is the last one before")
+    sub.add_argument("--hold-controls", action="store_true", help="with --data: an empty control is the last before it")
     sub = command("train", _train, "train a controller and a value function, on learned dynamics unless --exact")
     _add(sub, "problem", "out", "seed", "exact", "effort", "quick")
     sub = command("solve", _solve, "solve the problem from many initial states")

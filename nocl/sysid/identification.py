@@ -228,7 +228,7 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
         weights = fit_groups(source, parts, settings, seed, bar, kept)
         net, words = assemble(parts, weights, settings.angles), parts.words
         found = contradictions(net, source.box, stated, *some_labels(source, 500, seed)) if stated else []
-        _warn_of(found, "labels speak", 3)
+        _warn_of(found, "labels speak", 4)
     card = {"method": method, "gradients": source.gradients, "seed": seed, "settings": asdict(settings),
             "labels": source.labels, "seconds": round(time.perf_counter() - start, 3), "torch": torch.__version__}
     card["score"] = _score_text(system, net)
@@ -250,7 +250,7 @@ def _from_log(system: System, log: Log, stated: Stated, settings: LogSettings, s
     said = contradictions_of(log, stated)
     net, stages = fit_log(log, parts, settings, seed, bar)
     seen = validate(net, log, (1, min(settings.window, max(map(len, log)) - 1)), substeps=settings.substeps)
-    _warn_of(said, "log speaks", 4)
+    _warn_of(said, "log speaks", 5)
     _warn_of_no_progress(stages, seen)
     errors = ", ".join(f"{100 * e:.3g} % after {k}" for k, e in zip(seen.steps, seen.relative, strict=True))
     card = {"method": "log", "gradients": False, "seed": seed, "settings": asdict(settings), "labels": len(log),
@@ -271,11 +271,11 @@ def _warn_of_no_progress(stages: list[Stage], seen: Validation) -> None:
     if stages and stages[0].failed:
         warnings.warn(f"identify: no step lowered the simulation error, not even over {stages[0].steps} samples "
                       f"({stages[0].last:.3g} times the noise): f_theta is that of smoothed derivatives; log at a "
-                      "higher rate, look for outliers, or state what is known", UserWarning, stacklevel=4)
+                      "higher rate, look for outliers, or state what is known", UserWarning, stacklevel=5)
     elif (share := float((seen.relative / seen.still_relative).min())) > NO_BETTER:
         warnings.warn(f"identify: f_theta predicts its own log little better than standing still ({100 * share:.2g} % "
                       "of that error): log longer or livelier recordings, or state what is known", UserWarning,
-                      stacklevel=4)
+                      stacklevel=5)
 
 
 def _check_stated(stated: Stated, method: str) -> None:

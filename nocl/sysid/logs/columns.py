@@ -38,9 +38,9 @@ def _real(value: Any, what: str, owner: str) -> Array:
     try:
         return checks.real(value)
     except (TypeError, ValueError, OverflowError, RuntimeError) as error:
-        why = str(error) if isinstance(value, np.ma.MaskedArray) else f"is a {type(value).__name__}"
-        raise ValueError(f"{owner}: {what} {why} that is no array of numbers; expected one row for each sample, NaN "
-                         "where one is missing: join several runs and tell them apart by `run`") from None
+        why = str(error) if str(error).startswith(("is a masked", "holds ")) else f"is a {type(value).__name__}"
+        raise ValueError(f"{owner}: {what} {why}; expected an array of numbers, one row for each sample, NaN where one "
+                         "is missing: join several runs and tell them apart by `run`") from None
 
 
 def seconds(t: Any, owner: str) -> Array:

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from nocl.support.checks import Array
 from nocl.sysid.logs.columns import labels_of, numbers, rows_of, seconds
 from nocl.sysid.logs.files import Table, read_table, write_table
-from nocl.sysid.logs.plausible import check_rate, check_times, check_values, unwrapped
+from nocl.sysid.logs.plausible import check_rate, check_rates, check_times, check_values, unwrapped
 from nocl.sysid.logs.smoothing import Smooth, smooth
 from nocl.system import System, counted
 
@@ -201,7 +201,7 @@ def _log(system: System, samples: _Samples, max_gap: float, hold_controls: bool,
                       UserWarning, stacklevel=3)
     log = Log(system.state_names, system.control_names, tuple(pieces), left_out)
     if samples.xdot is not None:
-        _check_logged_rates(log, owner)
+        _check_logged_rates(log, system, owner)
     return log
 
 
@@ -270,8 +270,10 @@ def _piece(system: System, run: str, samples: _Samples, rows: Any, owner: str) -
     return Run(run, samples.t[rows], x, samples.u[rows[:-1]], None if samples.xdot is None else samples.xdot[rows])
 
 
-def _check_logged_rates(log: Log, owner: str) -> None:
+def _check_logged_rates(log: Log, system: System, owner: str) -> None:
     """ValueError where logged derivatives are in other units than the states, or than time."""
     for i, name in enumerate(log.states):
-        check_rate([r.x[:, i] for r in log], [r.xdot[:, i] for r in log if r.xdot is not None], [r.t for r in log],
-                   name, f"its column d{name}/dt", owner)
+        rates = [r.xdot[:, i] for r in log if r.xdot is not None]
+        for r, rate in zip(log, rates, strict=True):
+            check_rates(rate, r.t, system.lbx[i], system.ubx[i], name, owner)
+        check_rate([r.x[:, i] for r in log], rates, [r.t for r in log], name, f"its column d{name}/dt", owner)

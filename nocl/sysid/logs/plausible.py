@@ -18,7 +18,7 @@ SMALL, VANISHING = 1e-6, 1e-100  # of the box: the largest value to warn of, to 
 SHORTEST, LONGEST = 1e-12, 1e12  # usual step of time
 DIGITS = 1e-3  # of a usual step: what times may be rounded by
 SLACK = 1.0  # rad that noise may add to the circle
-ALIKE, RATIO = 0.5, 1.5  # share of a state's motion that a rate explains; how far off its size may then be
+ALIKE, RATIO = 0.8, 1.5  # share of a state's motion that a rate explains; how far off its size may then be
 FACTORS = {  # (d NAME/dt in the log) / (what it should be) -> the usual reason
     1e-3: "is t in ms?", 1e-6: "is t in us?", 1e-9: "is t in ns?", 60: "is t in minutes?", 3600: "is t in hours?",
     86400: "is t in days?", 180 / np.pi: "is {name} in degrees, its rate in radians?",
@@ -64,6 +64,16 @@ def check_values(values: Array, lb: float, ub: float, name: str, owner: str) -> 
         warnings.warn(f"{said}: is it in another unit?", UserWarning, stacklevel=4)
 
 
+def check_rates(rate: Array, t: Array, lb: float, ub: float, name: str, owner: str) -> None:
+    """ValueError for logged derivatives [n] that cross the state's box in far less than a step."""
+    most = BEYOND * (ub - lb) / float(np.median(np.diff(t)))
+    bad = np.flatnonzero(np.isinf(rate) | (np.abs(rate) > most))
+    if bad.size:
+        raise ValueError(f"{owner}: d{name}/dt at t = {t[bad[0]]:g} is {rate[bad[0]]:.4g}; expected at most "
+                         f"{most:.3g}, which crosses the box [{lb:g}, {ub:g}] a thousand times a step: drop that "
+                         "sample (NaN where it is missing), convert the unit, or widen the system's box")
+
+
 def unwrapped(angle: Array, samples: Any, name: str, owner: str) -> Array:
     """A piece's angle [n] without jumps, NaN where it is missing; ValueError where it is neither on a circle nor
     continuous, as degrees are."""
@@ -96,10 +106,15 @@ def check_rate(x: list[Array], rate: list[Array], t: list[Array], name: str, wor
     near = [f for f in FACTORS if 1 / 1.1 < factor / f < 1.1]
     factor = near[0] if near else factor
     hint = FACTORS[factor].format(name=name) if near else "are both in the units of one system?"
-    said = f"d {name}/dt in the log is {factor:.4g} times {words}"
+    said = f"d {name}/dt in the log is {_three_digits(factor)} times {words}"
     if abs(factor) < 1:
-        said = f"{words} is {1 / factor:.4g} times d {name}/dt in the log"
+        said = f"{words} is {_three_digits(1 / factor)} times d {name}/dt in the log"
     raise ValueError(f"{owner}: {said}; expected them equal: {hint}")
+
+
+def _three_digits(value: float) -> str:
+    """'1000', not '1e+03'."""
+    return f"{float(f'{value:.3g}'):g}"
 
 
 def _motion(x: Array, rate: Array, t: Array) -> tuple[Array, Array]:

@@ -62,7 +62,7 @@ class Windows:
         start, there = np.stack([states[i][k] for i, k in at]), np.isfinite(x)
         sigma = np.hypot(noise(log), NOISE_FLOOR * spread_of(np.concatenate([r.smooth.x for r in log])))
         arrays = (start, np.where(there, x, 0.0), there.astype(float), u, h[..., None], sigma)
-        return Windows(*(torch.from_numpy(np.ascontiguousarray(a)) for a in arrays), tuple(at))
+        return Windows(*(torch.from_numpy(np.ascontiguousarray(a)) for a in arrays), at=tuple(at))
 
     def __getitem__(self, rows: slice) -> Windows:
         return Windows(self.start[rows], self.x[rows], self.there[rows], self.u[rows], self.h[rows], self.noise,
