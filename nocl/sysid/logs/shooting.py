@@ -32,7 +32,7 @@ from nocl.sysid.settings import LogSettings
 from nocl.translate.rk4 import rk4_interval
 
 NOISE_FLOOR = 1e-3  # of a state's spread: logs without noise would weigh rounding
-CHUNK = 50  # windows whose sensitivities are held at a time
+HELD = 2**23  # numbers of sensitivities that are held at a time
 REJECTIONS = 12  # of a step, before it is given up
 SHORTEST = 2  # steps of the first windows
 PATIENCE = 3  # steps that together have to take off this share of the loss: of windows to grow yet, of the last
@@ -133,7 +133,8 @@ class _Problem:
     def normal(self, theta: Tensor, start: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """(J'J [P, P], J'r [P]), starts projected out, and a [W, nx], A [W, nx, P]: starts move a + A dtheta."""
         JJ, Jr, a, A = torch.zeros(len(theta), len(theta), dtype=theta.dtype), torch.zeros_like(theta), [], []
-        for first, last in pairwise([*range(0, len(start), CHUNK), len(start)]):
+        chunk = max(HELD // (self.windows.x[0].numel() * len(theta)), 1)
+        for first, last in pairwise([*range(0, len(start), chunk), len(start)]):
             R, D, r = self.sensitivities(theta, self.windows[first:last], start[first:last])
             Q, T = torch.linalg.qr(D)  # [w, rows, nx], [w, nx, nx]
             QR, Qr = Q.transpose(1, 2) @ R, Q.transpose(1, 2) @ r[..., None]
