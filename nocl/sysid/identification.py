@@ -272,10 +272,9 @@ def _warn_of_no_progress(stages: list[Stage], seen: Validation) -> None:
         warnings.warn(f"identify: no step lowered the simulation error, not even over {stages[0].steps} samples "
                       f"({stages[0].last:.3g} times the noise): f_theta is that of smoothed derivatives; log at a "
                       "higher rate, look for outliers, or state what is known", UserWarning, stacklevel=5)
-    elif (share := float((seen.relative / seen.still_relative).min())) > NO_BETTER:
-        warnings.warn(f"identify: f_theta predicts its own log little better than standing still ({100 * share:.2g} % "
-                      "of that error): log longer or livelier recordings, or state what is known", UserWarning,
-                      stacklevel=5)
+    elif (seen.relative > NO_BETTER * seen.still_relative).all():
+        warnings.warn("identify: f_theta predicts its own log little better than standing still, or worse: log longer "
+                      "or livelier recordings, or state what is known", UserWarning, stacklevel=5)
 
 
 def _check_stated(stated: Stated, method: str) -> None:

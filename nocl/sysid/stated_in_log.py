@@ -13,6 +13,7 @@ from nocl.sysid.logs.plausible import check_rate
 from nocl.sysid.stated import Stated
 
 SIGMAS = 3.0  # times what noise explains
+LARGEST = 1e100  # of a rate: squares must not overflow
 COARSE = 0.25  # of how far a rate moves in a step: what the trapezoidal rule may miss, and no more than half
 
 
@@ -26,12 +27,22 @@ def contradictions_of(log: Log, stated: Stated) -> list[str]:
         name, rate = log.states[i], _rows(ca.Function("row", [stated.z], [row]))
         x, t = [r.x[:, i] for r in log], [r.t for r in log]
         last = [np.vstack([r.u, r.u[-1:]]) for r in log]
-        check_rate(x, [rate(r.x, u) for r, u in zip(log, last, strict=True)], t, name, str(row), "identify: known")
+        rates = [rate(r.x, u) for r, u in zip(log, last, strict=True)]
+        _check_finite(log, rates, f"d {name}/dt = {row}")
+        check_rate(x, rates, t, name, str(row), "identify: known")
         missed, size, allowed = _misses(log, i, rate)
         if missed > allowed:
             said.append(f"d {name}/dt = {row} misses the log's own steps by {missed:.3g} (rms; their mean rates: "
                         f"{size:.3g}), where noise and sampling explain {allowed:.3g}")
     return said
+
+
+def _check_finite(log: Log, rates: list[Array], words: str) -> None:
+    for r, values in zip(log, rates, strict=True):
+        bad = np.flatnonzero(np.isfinite(r.x).all(axis=1) & ~(np.abs(values) < LARGEST))
+        if bad.size:
+            raise ValueError(f"identify: known: {words} is {values[bad[0]]:.4g} at t = {r.t[bad[0]]:g} of run {r.run}; "
+                             "expected numbers of ordinary size wherever the log has been: correct the row")
 
 
 def _misses(log: Log, i: int, rate: Callable[[Array, Array], Array]) -> tuple[float, float, float]:

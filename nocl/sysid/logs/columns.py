@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from datetime import date, datetime, timedelta
 from numbers import Real
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from nocl.support import checks
 from nocl.support.checks import Array
@@ -99,16 +99,17 @@ def _number(cell: Any, i: int, name: str, path: str | Path) -> float:
                      "empty cells where a sample is missing: remove lines of units, and separators of thousands")
 
 
-def labels_of(run: ArrayLike | None, n: int, owner: str) -> list[str]:
+def labels_of(run: Any, n: int, owner: str) -> list[str]:
     """A label for each sample; ValueError for missing ones, and for text among numbers."""
     if run is None:
         return ["0"] * n
-    values = run.tolist() if hasattr(run, "tolist") else list(run)  # type: ignore[arg-type]
+    values = run.tolist() if hasattr(run, "tolist") else list(run) if isinstance(run, Iterable) else [run]
     if not isinstance(values, list) or len(values) != n:
-        raise ValueError(f"{owner}: run has shape {np.shape(values)}; expected ({n},), a label for each sample")
+        shape = (len(values),) if isinstance(values, list) else ()
+        raise ValueError(f"{owner}: run has shape {shape}; expected ({n},), a label for each sample")
     text = [isinstance(v, str) for v in values]
     for i, v in enumerate(values):
-        label = isinstance(v, (str, date)) or (isinstance(v, Real) and v == v)
+        label = isinstance(v, (str, date)) or (isinstance(v, Real) and v == v and v not in (math.inf, -math.inf))
         if not label or str(v).lower() in NO_LABEL or str(v) != str(v).strip():
             raise ValueError(f"{owner}: run of sample {i} is {v!r}; expected a label, like 0 or 'morning': name the "
                              "recording that the sample belongs to, or drop it")

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.sysid.logs.columns import labels_of, numbers, rows_of, seconds
 from nocl.sysid.logs.files import Table, read_table, write_table
@@ -179,7 +180,9 @@ def _check_names(states: tuple[str, ...], controls: tuple[str, ...]) -> None:
 
 def _log(system: System, samples: _Samples, max_gap: float, hold_controls: bool, owner: str) -> Log:
     """The log of samples, after what can be checked of them as they are."""
-    if not (np.isfinite(max_gap) and max_gap > 1):
+    if not isinstance(hold_controls, bool):
+        raise ValueError(f"{owner}: hold_controls is {hold_controls!r}; expected True or False")
+    if not checks.number(max_gap, "max_gap", owner) > 1:
         raise ValueError(f"{owner}: max_gap is {max_gap!r}; expected a number > 1, in usual steps of time")
     for i, name in enumerate(system.state_names):
         check_values(samples.x[:, i], system.lbx[i], system.ubx[i], name, owner)
@@ -190,10 +193,7 @@ def _log(system: System, samples: _Samples, max_gap: float, hold_controls: bool,
     if hold_controls:
         samples = replace(samples, u=_held(samples.u, samples.run))
     pieces, left_out = _pieces(system, samples, max_gap, owner)
-    remedy = "log at regular times, or raise max_gap"
-    if unknown > n / 4 and not hold_controls:
-        remedy = (f"a control is missing in {unknown} of them: where it is logged only when it changes, pass "
-                  "hold_controls=True (--hold-controls), else log it at every sample")
+    remedy = _remedy(samples, unknown, hold_controls)
     if not pieces:
         raise ValueError(f"{owner}: no piece of the {n} samples has {LEAST} in a row; expected longer runs: {remedy}")
     if left_out > n / 2:
@@ -203,6 +203,19 @@ def _log(system: System, samples: _Samples, max_gap: float, hold_controls: bool,
     if samples.xdot is not None:
         _check_logged_rates(log, system, owner)
     return log
+
+
+def _remedy(samples: _Samples, unknown: int, held: bool) -> str:
+    """What makes pieces longer; `unknown` samples came without a control."""
+    n, holes = len(samples.t), int(np.isnan(samples.x).any(axis=1).sum())
+    if unknown > n / 4 and not held:
+        return (f"a control is missing in {unknown} of them: where it is logged only when it changes, pass "
+                "hold_controls=True (--hold-controls), else log it at every sample")
+    if np.isnan(samples.u).all():
+        return "no control is known: log it where it changes, and at the start"
+    if holes > n / 4:
+        return f"a state is missing in {holes} of them: log all states, or find the others by an observer first"
+    return "log at regular times, or raise max_gap"
 
 
 def _held(u: Array, run: list[str]) -> Array:

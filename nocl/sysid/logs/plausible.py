@@ -14,11 +14,13 @@ import numpy as np
 from nocl.support.checks import Array
 
 FAR, BEYOND = 8.0, 1000.0  # half widths of its box from the middle: a value to warn of, one to refuse
-SMALL, VANISHING = 1e-6, 1e-100  # of the box: the largest value to warn of, to refuse
+SMALL, VANISHING = 1e-6, 1e-100  # of the box: the largest value to warn of, to refuse: squares must not vanish
 SHORTEST, LONGEST = 1e-12, 1e12  # usual step of time
 DIGITS = 1e-3  # of a usual step: what times may be rounded by
 SLACK = 1.0  # rad that noise may add to the circle
+NEARLY, OFTEN = 0.75, 0.05  # of a half turn in a step; the share of such steps to warn of
 ALIKE, RATIO = 0.8, 1.5  # share of a state's motion that a rate explains; how far off its size may then be
+CLOSE = 0.1  # of a factor to one that has a usual reason
 FACTORS = {  # (d NAME/dt in the log) / (what it should be) -> the usual reason
     1e-3: "is t in ms?", 1e-6: "is t in us?", 1e-9: "is t in ns?", 60: "is t in minutes?", 3600: "is t in hours?",
     86400: "is t in days?", 180 / np.pi: "is {name} in degrees, its rate in radians?",
@@ -40,14 +42,14 @@ def check_times(t: Array, usual: float, owner: str) -> None:
 
 def check_values(values: Array, lb: float, ub: float, name: str, owner: str) -> None:
     """ValueError for values of a state or control that its box makes impossible, a warning for odd ones."""
-    bad = np.flatnonzero(np.isinf(values))
+    bad = np.flatnonzero(np.abs(values) > 1 / VANISHING)
     if bad.size:
-        raise ValueError(f"{owner}: {name} of sample {bad[0]} is {values[bad[0]]}; expected a number, or NaN where "
-                         "it is missing")
+        raise ValueError(f"{owner}: {name} of sample {bad[0]} is {values[bad[0]]:.4g}; expected a number of ordinary "
+                         "size, or NaN where it is missing: drop it, or convert the unit")
     if not np.isfinite(values).any():
         return
     box, widest = f"its box [{lb:g}, {ub:g}]", max(abs(lb), abs(ub))
-    off = np.abs(values / 2 - (lb + ub) / 4) / ((ub - lb) / 4)  # halves: 1e308 must not overflow
+    off = np.abs(values - (lb + ub) / 2) / ((ub - lb) / 2)
     k = int(np.nanargmax(off))
     if off[k] > FAR:
         said = (f"{owner}: {name} of sample {k} is {values[k]:.4g}, {off[k]:.3g} times as far from the middle as {box} "
@@ -55,11 +57,12 @@ def check_values(values: Array, lb: float, ub: float, name: str, owner: str) -> 
         if off[k] > BEYOND:
             raise ValueError(f"{said}; expected values near it: drop that sample (NaN where it is missing), convert "
                              "the unit, or widen the system's box")
-        warnings.warn(f"{said}: is it in another unit? Else widen the system's box", UserWarning, stacklevel=4)
+        warnings.warn(f"{said}: is it an outlier, or in another unit? Else widen the system's box", UserWarning,
+                      stacklevel=4)
     largest = float(np.nanmax(np.abs(values)))
-    if 0 < largest < SMALL * widest:
+    if 0 < largest < max(SMALL * widest, VANISHING):
         said = f"{owner}: {name} never exceeds {largest:.3g}, beside {box}"
-        if largest < VANISHING * widest:
+        if largest < VANISHING * max(widest, 1.0):
             raise ValueError(f"{said}; expected values of its size: convert the unit, or write 0")
         warnings.warn(f"{said}: is it in another unit?", UserWarning, stacklevel=4)
 
@@ -87,6 +90,10 @@ def unwrapped(angle: Array, samples: Any, name: str, owner: str) -> Array:
                          "it, or log more often")
     found = angle.copy()
     found[there] = np.unwrap(angle[there])
+    wide = np.abs(np.diff(found[there])) > NEARLY * np.pi
+    if wide.mean() > OFTEN:
+        warnings.warn(f"{owner}: the angle {name} turns by more than {NEARLY:g} pi in {100 * wide.mean():.2g} % of the "
+                      "steps: which way is a guess; log more often, or convert the unit", UserWarning, stacklevel=6)
     return found
 
 
@@ -103,9 +110,11 @@ def check_rate(x: list[Array], rate: list[Array], t: list[Array], name: str, wor
     factor = both / other
     if factor > 0 and 1 / RATIO <= factor <= RATIO:
         return
-    near = [f for f in FACTORS if 1 / 1.1 < factor / f < 1.1]
-    factor = near[0] if near else factor
-    hint = FACTORS[factor].format(name=name) if near else "are both in the units of one system?"
+    near = min((abs(np.log(factor / f)), f) for f in FACTORS if factor / f > 0)
+    hint = "are both in the units of one system?"
+    if near[0] < CLOSE:
+        factor = near[1]
+        hint = FACTORS[factor].format(name=name)
     said = f"d {name}/dt in the log is {_three_digits(factor)} times {words}"
     if abs(factor) < 1:
         said = f"{words} is {_three_digits(1 / factor)} times d {name}/dt in the log"

@@ -43,13 +43,13 @@ ENOUGH, LAST = 0.05, 0.01
 class Windows:
     """Pieces of runs of m steps; short ones are filled up with steps of length 0 that count for nothing."""
 
+    at: Sequence[tuple[int, int]]  # [W] of (run, sample), where in the log each one starts
     start: Tensor  # [W, nx], where simulations start at first
     x: Tensor  # [W, m+1, nx], logged, 0 where missing
     there: Tensor  # [W, m+1, nx], 1 where logged
     u: Tensor  # [W, m, nu]
     h: Tensor  # [W, m, 1]
     noise: Tensor  # [nx], what residuals are measured in
-    at: tuple[tuple[int, int], ...]  # [W] of (run, sample), where in the log each one starts
 
     @staticmethod
     def of(log: Log, states: Sequence[Array], m: int, most: int, rng: np.random.Generator) -> Windows:
@@ -62,11 +62,12 @@ class Windows:
         start, there = np.stack([states[i][k] for i, k in at]), np.isfinite(x)
         sigma = np.hypot(noise(log), NOISE_FLOOR * spread_of(np.concatenate([r.smooth.x for r in log])))
         arrays = (start, np.where(there, x, 0.0), there.astype(float), u, h[..., None], sigma)
-        return Windows(*(torch.from_numpy(np.ascontiguousarray(a)) for a in arrays), at=tuple(at))
+        tensors = [torch.from_numpy(np.ascontiguousarray(a)) for a in arrays]
+        return Windows(tuple(at), *tensors)
 
     def __getitem__(self, rows: slice) -> Windows:
-        return Windows(self.start[rows], self.x[rows], self.there[rows], self.u[rows], self.h[rows], self.noise,
-                       self.at[rows])
+        return Windows(self.at[rows], self.start[rows], self.x[rows], self.there[rows], self.u[rows], self.h[rows],
+                       self.noise)
 
     def __len__(self) -> int:
         return len(self.start)
