@@ -1,5 +1,7 @@
 """The simulation error: its sensitivities, its Gauss-Newton step, windows with holes."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,7 @@ import torch
 from nocl.sysid.from_log import initial
 from nocl.sysid.labels import box_of
 from nocl.sysid.logs.log import Log
-from nocl.sysid.logs.shooting import Windows, _Problem, fit_simulation
+from nocl.sysid.logs.shooting import Stage, Windows, _Problem, lengths
 from nocl.sysid.networks import assemble
 from nocl.sysid.settings import LogSettings
 from nocl.sysid.stated import Stated
@@ -27,7 +29,7 @@ def problem(substeps: int = 1, ridge: float = 0.0, n: int = 12) -> _Problem:
     weights[0][2] = torch.from_numpy(0.3 * rng.standard_normal(weights[0][2].shape))
     net = assemble(parts, weights, True)
     unit = torch.from_numpy(rng.uniform(0.5, 2.0, sum(p.numel() for p in net.parameters())))
-    windows = Windows.of(log, 4, 100, rng)
+    windows = Windows.of(log, [r.smooth.x for r in log], 4, 100, rng)
     return _Problem(net, unit, windows, substeps, ridge)
 
 
@@ -42,7 +44,7 @@ def test_sensitivities_are_autograds(substeps):
     R, D, r = p.sensitivities(theta, w, w.start)
 
     def residuals(theta, start):
-        return w.residuals(p.f(theta), start, substeps).reshape(len(w), -1)
+        return w.residuals(w.paths(p.f(theta), start, substeps)).reshape(len(w), -1)
 
     torch.testing.assert_close(r, residuals(theta, w.start), atol=1e-10, rtol=1e-10)
     by_theta, by_start = torch.autograd.functional.jacobian(residuals, (theta, w.start))
@@ -80,7 +82,36 @@ def test_windows_hold_every_sample_and_count_holes_out():
 
 def test_each_step_lowers_the_error():
     p, seen = problem(ridge=1e-6), []
-    before = p.loss(theta_of(p), p.windows.start) ** 0.5
-    fit_simulation(p.net, p.unit.numpy(), p.windows, steps=8, substeps=1, ridge=1e-6, report=seen.append)
+    theta, start, stage = p.minimise(theta_of(p), 8, 1e-4, seen.append)
     assert seen == sorted(seen, reverse=True)
-    assert seen[-1] < before  # by how much is up to the noise, which no model meets
+    assert stage.last == seen[-1] < stage.first  # by how much is up to the noise
+    assert stage.taken == len(seen)
+    assert p.loss(theta, start) ** 0.5 == pytest.approx(stage.last, rel=1e-12)
+    assert not stage.failed
+
+
+def test_no_step_is_a_failure_unless_the_noise_is_reached():
+    p = problem(ridge=1e-6)
+    stage = p.minimise(theta_of(p), 0, 1e-4, lambda _: None)[2]
+    assert stage.first > 1
+    assert stage.failed
+    assert not Stage(4, 0.9, 0.9, 0).failed
+    assert Stage(2, math.inf, math.inf, 0).failed
+    assert Stage(2, math.nan, math.nan, 0).failed
+
+
+def test_windows_grow_to_the_longest_run():
+    system = pendulum.system()
+    log = Log.of(system, 0.1 * np.arange(23), np.zeros((23, 2)), np.zeros(23))
+    for window, expected in ((40, [2, 5, 11, 22]), (16, [2, 4, 8, 16]), (3, [3]), (2, [2]), (1, [1])):
+        assert lengths(window, log) == expected
+
+
+def test_the_next_windows_start_at_the_states_that_were_fitted():
+    p = problem()
+    start, states = p.windows.start + 1.0, [np.zeros((12, 2))]
+    p.put(states, theta_of(p), start)
+    with torch.no_grad():
+        paths = p.windows.paths(p.f(theta_of(p)), start, 1).numpy()
+    np.testing.assert_array_equal(states[0][:8].reshape(2, 4, 2), paths[:2, :4])
+    np.testing.assert_array_equal(states[0][8:], paths[2, :4])  # the last window has three steps

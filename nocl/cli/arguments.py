@@ -55,6 +55,21 @@ def grid(text: str) -> tuple[int, ...]:
         raise argparse.ArgumentTypeError(f"{text!r}; expected numbers of nodes, like 41,81,81") from None
 
 
+def known(text: str) -> dict[str, str | float]:
+    """States and what their derivatives are, p=v,theta=omega."""
+    found: dict[str, str | float] = {}
+    for word in text.split(","):
+        name, equal, value = (part.strip() for part in word.partition("="))
+        if not (name and equal and value) or name in found:
+            raise argparse.ArgumentTypeError(f"{text!r}; expected different states with their derivatives, like "
+                                             "p=v,theta=omega")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            found[name] = value
+    return found
+
+
 def words(text: str) -> tuple[str, ...]:
     return tuple(word.strip() for word in text.split(","))
 

@@ -77,6 +77,10 @@ def parser() -> argparse.ArgumentParser:
     _add(sub, "problem", "out", "seed", "effort", "quick")
     sub.add_argument("--data", type=Path, metavar="LOG", help="a .csv or .parquet file with columns t, states, "
                      "controls, and run: learn from it alone, test on a fifth of its runs")
+    sub.add_argument("--known", type=arguments.known, metavar="A=B,C=D", help="with --data: derivatives that are "
+                     "known, like p=v,theta=omega: d p/dt = v; a number, or a state's or control's name")
+    sub.add_argument("--control-affine", action="store_true", help="with --data: xdot = a(x) + B(x) u")
+    sub.add_argument("--hold-controls", action="store_true", help="with --data: an empty control is the last before it")
     sub = command("train", _train, "train a controller and a value function, on learned dynamics unless --exact")
     _add(sub, "problem", "out", "seed", "exact", "effort", "quick")
     sub = command("solve", _solve, "solve the problem from many initial states")
@@ -199,10 +203,12 @@ def _identify(args: argparse.Namespace) -> None:
     ocp, out = _problem(args)
     stages = Stages(ocp, out, args.seed, args.effort)
     stages.check(exact=False)
-    if args.data is None:
-        stages.identify()
+    if args.data is not None:
+        stages.identify_log(args.data, args.known, args.control_affine, args.hold_controls)
+    elif args.known or args.control_affine or args.hold_controls:
+        raise ValueError("--known, --control-affine and --hold-controls are for logs: name one by --data")
     else:
-        stages.identify_log(args.data)
+        stages.identify()
 
 
 def _train(args: argparse.Namespace) -> None:

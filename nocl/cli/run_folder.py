@@ -35,6 +35,7 @@ from nocl.sysid.logs.log import Log
 
 PARTS = ("dynamics", "cnd", "export", "report", "checkpoint")  # folders in a run's folder
 KEY = "run"  # of a card: what the stage was made from
+OF_LOGS = ("data", "known", "control_affine", "hold_controls")  # of that, what dynamics of a log have more
 
 
 @dataclass(frozen=True)
@@ -72,20 +73,23 @@ class Stages:
         say(f"dynamics: {model.card.get('score', 'done')}, {time.perf_counter() - start:.0f} s")
         return model
 
-    def identify_log(self, path: Path) -> LearnedDynamics:
+    def identify_log(self, path: Path, known: dict[str, str | float] | None = None, control_affine: bool = False,
+                     hold_controls: bool = False) -> LearnedDynamics:
         """The dynamics learned from a log, in dynamics/; their errors on a fifth of its recordings are shown first."""
-        log = Log.read(path, self.ocp.system)
-        made_from, there = self._made_from(data=sha256(path.read_bytes())), self._dynamics_there()
+        log = Log.read(path, self.ocp.system, hold_controls=hold_controls)
+        stated: dict[str, Any] = {"known": known, "control_affine": control_affine}
+        made_from = self._made_from(data=sha256(path.read_bytes()), **stated, hold_controls=hold_controls)
+        there = self._dynamics_there()
         if there is not None and there.card[KEY] == made_from:
             say(f"dynamics: taken from {self.folder / 'dynamics'} ({there.card['score']})")
             return there
         say(f"dynamics: {log!r}" + _anew(there))
         settings = LogSettings.of(self.effort)
         start = time.perf_counter()
-        model = identify(self.ocp.system, data=log, seed=self.seed, settings=settings)
+        model = identify(self.ocp.system, data=log, seed=self.seed, settings=settings, **stated)
         if len({r.run for r in log}) > 1:
             train, test = log.split(seed=self.seed)
-            held = identify(self.ocp.system, data=train, seed=self.seed, settings=settings)
+            held = identify(self.ocp.system, data=train, seed=self.seed, settings=settings, **stated)
             say(f"learned from four fifths of the recordings, simulated on the others:\n{held.validate(test)}")
         outside = int(model.outside(fresh_states(self.ocp, 100, self.seed)).sum())
         if outside:
@@ -99,7 +103,7 @@ class Stages:
         """The controller and value function, in cnd/; on dynamics/ unless exact."""
         self.ocp.check_strict("train")  # before dynamics are learned for nothing
         model = None if exact else self.identify()
-        data = {} if model is None else {k: v for k, v in model.card[KEY].items() if k == "data"}
+        data = {} if model is None else {k: v for k, v in model.card[KEY].items() if k in OF_LOGS}
         made_from, there = self._made_from(exact=exact, **data), self._cnd_there()
         if there is not None and there.card.get(KEY) == made_from:
             say(f"controller: taken from {self.folder / 'cnd'}")

@@ -74,9 +74,9 @@ def positive(default: float | None, doc: str, *, most: float = math.inf, none: s
     return _field(default, doc, f"a finite number > 0{limit}", lambda v: _is_real(v) and 0 < v <= most, float, none)
 
 
-def nonnegative(default: float, doc: str) -> Any:
-    """A finite number >= 0."""
-    return _field(default, doc, "a finite number >= 0", lambda v: _is_real(v) and v >= 0, float)
+def nonnegative(default: float | None, doc: str, *, none: str = "") -> Any:
+    """A finite number >= 0; with `none`, also None, which means that."""
+    return _field(default, doc, "a finite number >= 0", lambda v: _is_real(v) and v >= 0, float, none)
 
 
 def flag(default: bool, doc: str) -> Any:

@@ -18,7 +18,7 @@ from nocl.support.checks import Array
 from nocl.sysid import fitting
 from nocl.sysid.logs.derivatives import labels
 from nocl.sysid.logs.log import Log, Recording
-from nocl.sysid.logs.shooting import Windows, fit_simulation, spread_of
+from nocl.sysid.logs.shooting import Stage, fit_simulation, lengths, spread_of
 from nocl.sysid.networks import assemble
 from nocl.sysid.progress import Progress
 from nocl.sysid.settings import LogSettings
@@ -27,20 +27,27 @@ from nocl.sysid.structure import Structure
 MEMORY = 30  # of L-BFGS
 
 
-def fit_log(log: Log, parts: Structure, settings: LogSettings, seed: int, bar: Progress) -> FeatureNet:
-    """f_theta of the given structure, fitted to a log."""
+def fit_log(log: Log, parts: Structure, settings: LogSettings, seed: int,
+            bar: Progress) -> tuple[FeatureNet, list[Stage]]:
+    """f_theta of the given structure, fitted to a log, and how the simulation error went down.
+
+    Raises ValueError where no finite weights were found.
+    """
     x, u, xdot = (np.concatenate(a) for a in zip(*map(labels, log), strict=True))
     net = assemble(parts, initial(parts, settings, seed), settings.angles)
     if not parts.groups:
-        return net
+        return net, []
     unit = output_units(parts, net, xdot)
     fit_derivatives(net, unit, x, u, xdot, settings, bar)
+    stages = []
     if settings.steps:
-        windows = Windows.of(log, settings.window, settings.windows, np.random.default_rng((seed, 3)))
-        with bar.stage("simulation error", settings.steps) as report:
-            fit_simulation(net, unit, windows, steps=settings.steps, substeps=settings.substeps, ridge=settings.ridge,
-                           report=report)
-    return net.requires_grad_(False)
+        total = settings.steps * len(lengths(settings.window, log))
+        with bar.stage("simulation error", total) as report:
+            stages = fit_simulation(net, unit, log, settings, np.random.default_rng((seed, 3)), report)
+    if not all(torch.isfinite(p).all() for p in net.parameters()):
+        raise ValueError("identify: the fit to the log is not finite; expected numbers of ordinary size: look for "
+                         "outliers, or scale states, controls and time")
+    return net.requires_grad_(False), stages
 
 
 def first_states(log: Log) -> list[tuple[Array, Recording]]:
@@ -81,9 +88,9 @@ def fit_derivatives(net: FeatureNet, unit: Array, x: Array, u: Array, xdot: Arra
     X, U, Y = (torch.from_numpy(np.ascontiguousarray(a)) for a in (x, u, xdot))
     scale = torch.from_numpy(1 / spread_of(xdot))
 
+    ridge = 1 / Y.numel() if settings.ridge is None else settings.ridge
     with bar.stage("derivatives", settings.iterations) as report:
-        _descend(net, unit, lambda: ((net(X, U) - Y) * scale).square().mean(), settings.iterations, settings.ridge,
-                 report)
+        _descend(net, unit, lambda: ((net(X, U) - Y) * scale).square().mean(), settings.iterations, ridge, report)
 
 
 def _descend(net: FeatureNet, unit: Array, loss: Callable[[], Tensor], iterations: int, ridge: float,

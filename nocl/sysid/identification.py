@@ -36,12 +36,14 @@ from nocl.sysid.from_log import first_states, fit_log
 from nocl.sysid.labels import Source, box_of, data_box, find_structure, labelled, rows_of, some_labels
 from nocl.sysid.logs.coverage import Coverage, share_of_nodes
 from nocl.sysid.logs.log import Log
+from nocl.sysid.logs.shooting import Stage
 from nocl.sysid.logs.validation import HORIZONS, Validation, validate
 from nocl.sysid.networks import assemble, fit_group, fit_groups, weights_of
 from nocl.sysid.progress import Checkpoint, Progress
 from nocl.sysid.score import Score, contradictions, score_of
 from nocl.sysid.settings import LogSettings, PaperSettings, Settings
 from nocl.sysid.stated import Known, Stated
+from nocl.sysid.stated_in_log import contradictions_of
 from nocl.sysid.structure import Box, Expansion, Group, Split, Structure
 from nocl.sysid.trial import better_affine
 from nocl.system import System
@@ -53,6 +55,7 @@ __all__ = ["LearnedDynamics", "LogSettings", "PaperSettings", "Score", "Settings
 
 RECIPES = ("default", "mlp", "paper")
 KIND = "dynamics"
+NO_BETTER = 0.5  # of the error of standing still: a model of a log that is warned of
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -100,7 +103,8 @@ class LearnedDynamics:
     def outside(self, x: ArrayLike, what: str | None = None) -> Any:
         """Which states [N, nx] the model was not taught about, [N] bool; a UserWarning names `what`, where given.
 
-        For a model of a log, what is far from all logged states (nocl.sysid.logs.coverage); else, what is outside X.
+        For a model of a log, what is far from all logged states (nocl.sysid.logs.coverage); else, what is outside the
+        box X.
         """
         if self.coverage is not None:
             return self.coverage.outside(x) if what is None else self.coverage.warn(x, what)
@@ -178,12 +182,12 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
         them where they are known; for a Log, it is of simulations on that log.
     data : Dataset or Log
         Labels to learn from instead; without Jacobians A, B, from values alone. A Log of trajectories is fitted by its
-        smoothed derivatives, then by simulation error (nocl.sysid.logs).
+        smoothed derivatives, then by simulation error (nocl.sysid.from_log).
     known : dict from states to their derivatives (SX, numbers, names of states or controls), or names of states
         Equations that need not be learned; a bare name stands for the system's own equation.
     control_affine : bool
         xdot = a(x) + B(x) u. Labels of f with Jacobians show that by themselves: drawn ones by moving the controls
-        alone, given ones by a trial (nocl.sysid.affine).
+        alone, given ones by a trial (nocl.sysid.trial).
     method : "default", "mlp" or "paper"
         Structure first; one plain sine network; the paper's network, loss and optimiser.
     settings : Settings, (method "paper") PaperSettings or (logs) LogSettings
@@ -224,7 +228,8 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
             "structure": _structure_data(parts), "gradients": source.gradients, "data": source.digest})
         weights = fit_groups(source, parts, settings, seed, bar, kept)
         net, words = assemble(parts, weights, settings.angles), parts.words
-        _warn_of(contradictions(net, source.box, stated, *some_labels(source, 500, seed)) if stated else [])
+        found = contradictions(net, source.box, stated, *some_labels(source, 500, seed)) if stated else []
+        _warn_of(found, "labels speak", 4)
     card = {"method": method, "gradients": source.gradients, "seed": seed, "settings": asdict(settings),
             "labels": source.labels, "seconds": round(time.perf_counter() - start, 3), "torch": torch.__version__}
     card["score"] = _score_text(system, net)
@@ -243,19 +248,34 @@ def _from_log(system: System, log: Log, stated: Stated, settings: LogSettings, s
     log.check(system)
     start = time.perf_counter()
     parts = stated.plain(data_box(system, np.vstack([np.hstack([s, r.u]) for s, r in first_states(log)])))
-    net = fit_log(log, parts, settings, seed, bar)
-    seen = validate(net, log, (1, settings.window), substeps=settings.substeps)
+    said = contradictions_of(log, stated)
+    net, stages = fit_log(log, parts, settings, seed, bar)
+    seen = validate(net, log, (1, min(settings.window, max(map(len, log)) - 1)), substeps=settings.substeps)
+    _warn_of(said, "log speaks", 5)
+    _warn_of_no_progress(stages, seen)
     errors = ", ".join(f"{100 * e:.3g} % after {k}" for k, e in zip(seen.steps, seen.relative, strict=True))
     card = {"method": "log", "gradients": False, "seed": seed, "settings": asdict(settings), "labels": len(log),
             "seconds": round(time.perf_counter() - start, 3), "torch": torch.__version__,
+            "windows": [asdict(stage) for stage in stages], "contradictions": said,
             "score": f"simulation error on its own log, in units of the states' spread: {errors} steps"}
     return LearnedDynamics(system, net, parts.words, card, parts, Coverage.of(log, system))
 
 
-def _warn_of(contradictions: list[str]) -> None:
+def _warn_of(contradictions: list[str], who: str, level: int) -> None:
     if contradictions:
-        warnings.warn(f"identify: the labels speak against what is stated, or the fit is poor: "
-                      f"{'; '.join(contradictions)}", UserWarning, stacklevel=3)
+        warnings.warn(f"identify: the {who} against what is stated, or the fit is poor: {'; '.join(contradictions)}",
+                      UserWarning, stacklevel=level)
+
+
+def _warn_of_no_progress(stages: list[Stage], seen: Validation) -> None:
+    """A UserWarning where a fit to a log came to nothing."""
+    if stages and stages[0].failed:
+        warnings.warn(f"identify: no step lowered the simulation error, not even over {stages[0].steps} samples "
+                      f"({stages[0].last:.3g} times the noise): f_theta is that of smoothed derivatives; log at a "
+                      "higher rate, look for outliers, or state what is known", UserWarning, stacklevel=5)
+    elif (seen.relative > NO_BETTER * seen.still_relative).all():
+        warnings.warn("identify: f_theta predicts its own log little better than standing still, or worse: log longer "
+                      "or livelier recordings, or state what is known", UserWarning, stacklevel=5)
 
 
 def _check_stated(stated: Stated, method: str) -> None:

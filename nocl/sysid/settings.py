@@ -80,11 +80,14 @@ class LogSettings(Scaled):
 
     width: int = count(32, "of the two hidden layers")
     iterations: int = count(300, "of L-BFGS on derivatives", least=0)
-    steps: int = count(20, "Gauss-Newton steps on simulation error, at most; 0: derivatives alone", least=0)
-    window: int = count(40, "samples that are simulated in one go")
-    windows: int = count(1000, "at most, drawn at random beyond")
+    steps: int = count(20, "Gauss-Newton steps on simulation error, at most, for each length of windows; 0: "
+                       "derivatives alone", least=0)
+    window: int = count(40, "steps that are simulated in one go in the end: windows start with 2, and grow")
+    windows: int = count(1000, "of that length, at most, drawn at random beyond")
     substeps: int = count(1, "RK4 steps between two samples")
-    ridge: float = nonnegative(1e-6, "times the sum of squared weights, beside the mean of squared residuals")
+    ridge: float | None = nonnegative(None, "times the sum of squared weights, beside the mean of squared residuals",
+                                      none="one over the number of residuals, the most probable weights where those of "
+                                      "a standard normal distribution are expected")
     angles: bool = flag(True, "networks see angles as sin and cos")
 
 

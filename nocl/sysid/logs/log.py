@@ -7,21 +7,26 @@ Angles may be logged on a circle: they are unwrapped, so between two samples the
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from nocl.support import checks
 from nocl.support.checks import Array
+from nocl.sysid.logs.columns import labels_of, numbers, rows_of, seconds
 from nocl.sysid.logs.files import Table, read_table, write_table
+from nocl.sysid.logs.plausible import check_rate, check_rates, check_times, check_values, unwrapped
 from nocl.sysid.logs.smoothing import Smooth, smooth
 from nocl.system import System, counted
 
-TIME, RUN = "t", "run"
+TIME, RUN, PIECE = "t", "run", "run piece"  # columns of a file; the last is written, so that pieces stay apart
 LEAST = 5  # samples of a piece: fewer have no smoothed derivative
 
 
@@ -55,60 +60,63 @@ class Log:
 
     @staticmethod
     def of(system: System, t: ArrayLike, x: ArrayLike, u: ArrayLike, *, xdot: ArrayLike | None = None,
-           run: ArrayLike | None = None, max_gap: float = 1.5) -> Log:
+           run: ArrayLike | None = None, max_gap: float = 1.5, hold_controls: bool = False) -> Log:
         """The log of arrays t [N], x [N, nx], u [N, nu], xdot [N, nx]; `run` [N] tells recordings apart (default: one).
 
-        Raises ValueError for wrong shapes, times that do not rise within a run, and logs without a usable piece.
+        t is in seconds, or timestamps. `hold_controls`: a missing control is its run's last one, as in logs that have
+        it only when it changes.
+
+        Raises ValueError for wrong shapes, times that do not rise within a run, values that cannot be (far outside the
+        system's box, angles in degrees, times in another unit than derivatives), and logs without a usable piece.
         """
         if not isinstance(system, System):
             raise ValueError(f"Log: system is a {type(system).__name__}; expected a nocl.System")
         owner = f"log of {system.name!r}"
-        times = _rows(t, None, "t", owner)
+        times = seconds(t, owner)
         n = len(times)
-        arrays = {"x": _rows(x, (n, system.nx), "x", owner), "u": _rows(u, (n, system.nu), "u", owner)}
-        if xdot is not None:
-            arrays["xdot"] = _rows(xdot, (n, system.nx), "xdot", owner)
-        labels = np.zeros(n, dtype=int) if run is None else np.asarray(run)
-        if labels.shape != (n,):
-            raise ValueError(f"{owner}: run has shape {labels.shape}; expected ({n},), a label for each sample")
-        if not (np.isfinite(max_gap) and max_gap > 1):
-            raise ValueError(f"{owner}: max_gap is {max_gap!r}; expected a number > 1, in usual steps of time")
-        pieces, left_out = _pieces(system, times, arrays, labels, max_gap, owner)
-        if not pieces:
-            raise ValueError(f"{owner}: no piece of the {n} samples has {LEAST} in a row; expected longer runs: log "
-                             "at regular times, or raise max_gap")
-        return Log(system.state_names, system.control_names, tuple(pieces), left_out)
+        samples = _Samples(times, rows_of(x, n, system.state_names, "x", owner),
+                           rows_of(u, n, system.control_names, "u", owner),
+                           None if xdot is None else rows_of(xdot, n, system.state_names, "xdot", owner),
+                           labels_of(run, n, owner))
+        return _log(system, samples, max_gap, hold_controls, owner)
 
     @staticmethod
-    def read(path: str | Path, system: System, *, max_gap: float = 1.5) -> Log:
+    def read(path: str | Path, system: System, *, max_gap: float = 1.5, hold_controls: bool = False) -> Log:
         """A CSV or Parquet file with the columns `t`, the system's states and controls, and perhaps `run`, `dNAME/dt`.
 
-        Other columns are left aside. Parquet takes pyarrow: pip install 'nocl[data]'. ValueError for what is missing.
+        Other columns are left aside. t is in seconds, or timestamps (ISO 8601 in CSV). Parquet takes pyarrow: pip
+        install 'nocl[data]'. ValueError for what is missing, and as in `of`.
         """
+        _check_names(system.state_names, system.control_names)
         table = read_table(Path(path))
         needed = [TIME, *system.names]
         missing = [name for name in needed if name not in table]
         if missing:
             raise ValueError(f"{path}: no column {', '.join(missing)} (there: {', '.join(table) or 'none'}); expected "
-                             f"{', '.join(needed)}, and {RUN} where there are several runs: rename the columns")
-        numbers = {name: _numbers(table[name], name, path) for name in needed}
+                             f"{', '.join(needed)}, and {RUN} where there are several runs: rename the columns, and "
+                             "remove lines above them")
         rates = [f"d{name}/dt" for name in system.state_names]
         there = [name for name in rates if name in table]
         if there and len(there) < len(rates):
             raise ValueError(f"{path}: has the derivative(s) {', '.join(there)} only; expected all of "
                              f"{', '.join(rates)}, or none: they are then found by smoothing")
-        xdot = np.column_stack([_numbers(table[name], name, path) for name in rates]) if there else None
-        x, u = (np.column_stack([numbers[name] for name in names])
-                for names in (system.state_names, system.control_names))
-        runs = [str(label) for label in table[RUN]] if RUN in table else None
-        return Log.of(system, numbers[TIME], x, u, xdot=xdot, run=runs, max_gap=max_gap)
+        x, u, xdot = (np.column_stack([numbers(table[name], name, path) for name in names]) if names else None
+                      for names in (system.state_names, system.control_names, there))
+        assert x is not None
+        assert u is not None
+        times = seconds(table[TIME], str(path))
+        samples = _Samples(times, x, u, xdot, labels_of(table.get(RUN), len(times), str(path)), table.get(PIECE))
+        return _log(system, samples, max_gap, hold_controls, str(path))
 
     def write(self, path: str | Path) -> Path:
-        """Write a CSV or Parquet file that `read` reads; a run's last sample repeats its last control."""
-        columns: Table = {RUN: np.concatenate([[f"{r.run}"] * len(r) for r in self.runs]),
+        """Write a CSV or Parquet file that `read` reads as the same log; a piece's last sample has no control."""
+        _check_names(self.states, self.controls)
+        number = [sum(other.run == r.run for other in self.runs[:i]) for i, r in enumerate(self.runs)]
+        columns: Table = {RUN: np.concatenate([[r.run] * len(r) for r in self.runs]),
+                          PIECE: np.concatenate([[k] * len(r) for k, r in zip(number, self.runs, strict=True)]),
                           TIME: np.concatenate([r.t for r in self.runs])}
         x = np.concatenate([r.x for r in self.runs])
-        u = np.concatenate([np.vstack([r.u, r.u[-1:]]) for r in self.runs])
+        u = np.concatenate([np.vstack([r.u, np.full((1, len(self.controls)), np.nan)]) for r in self.runs])
         columns |= {name: x[:, i] for i, name in enumerate(self.states)}
         columns |= {name: u[:, i] for i, name in enumerate(self.controls)}
         if all(r.xdot is not None for r in self.runs):
@@ -149,42 +157,85 @@ class Log:
                 f"{step:.4g}, {missing} with a state missing, {self.left_out} left out")
 
 
-def _rows(value: ArrayLike, shape: tuple[int, int] | None, name: str, owner: str) -> Array:
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise ValueError(f"{owner}: {name} is a {type(value).__name__} that is no array of numbers; expected one row "
-                         "for each sample: join several runs and tell them apart by `run`") from None
-    if shape is not None and array.ndim == 1 and shape[1] == 1:
-        array = array[:, None]
-    if (shape is None and array.ndim != 1) or (shape is not None and array.shape != shape):
-        expected = "one time for each sample, [N]" if shape is None else f"{shape}, a row for each time"
-        raise ValueError(f"{owner}: {name} has shape {array.shape}; expected {expected}")
-    return array
+@dataclass(frozen=True, eq=False)
+class _Samples:
+    """All samples of a log, in their order."""
+
+    t: Array  # [N]
+    x: Array  # [N, nx], NaN where missing
+    u: Array  # [N, nu]
+    xdot: Array | None  # [N, nx]
+    run: list[str]  # [N]
+    piece: Any = None  # [N], where a file says to which piece of its run a sample belongs
 
 
-def _numbers(column: Any, name: str, path: str | Path) -> Array:
-    try:
-        return np.array([np.nan if v is None or v == "" else float(v) for v in column])
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: column {name!r} holds what is no number ({error}); expected numbers, and empty "
-                         "cells where a sample is missing") from None
+def _check_names(states: tuple[str, ...], controls: tuple[str, ...]) -> None:
+    """ValueError for names that a file's other columns have."""
+    own = {TIME, RUN, PIECE, *(f"d{name}/dt" for name in states)}
+    taken = [name for name in states + controls if name in own or name != name.strip()]
+    if taken:
+        raise ValueError(f"a file of logs has columns of its own by the name(s) {', '.join(sorted(own))}, or a system "
+                         f"has blanks around a name; got a state or control {taken[0]!r}: name its symbol differently")
 
 
-def _pieces(system: System, t: Array, arrays: dict[str, Array], labels: Any, max_gap: float,
-            owner: str) -> tuple[list[Recording], int]:
+def _log(system: System, samples: _Samples, max_gap: float, hold_controls: bool, owner: str) -> Log:
+    """The log of samples, after what can be checked of them as they are."""
+    if not isinstance(hold_controls, bool):
+        raise ValueError(f"{owner}: hold_controls is {hold_controls!r}; expected True or False")
+    if not checks.number(max_gap, "max_gap", owner) > 1:
+        raise ValueError(f"{owner}: max_gap is {max_gap!r}; expected a number > 1, in usual steps of time")
+    for i, name in enumerate(system.state_names):
+        check_values(samples.x[:, i], system.lbx[i], system.ubx[i], name, owner)
+    for i, name in enumerate(system.control_names):
+        check_values(samples.u[:, i], system.lbu[i], system.ubu[i], name, owner)
+    n = len(samples.t)
+    unknown = int((~np.isfinite(samples.u)).any(axis=1).sum())
+    if hold_controls:
+        samples = replace(samples, u=_held(samples.u, samples.run))
+    pieces, left_out = _pieces(system, samples, max_gap, owner)
+    remedy = _remedy(samples, unknown, hold_controls)
+    if not pieces:
+        raise ValueError(f"{owner}: no piece of the {n} samples has {LEAST} in a row; expected longer runs: {remedy}")
+    if left_out > n / 2:
+        warnings.warn(f"{owner}: {left_out} of {n} samples are left out, in pieces of fewer than {LEAST}: {remedy}",
+                      UserWarning, stacklevel=3)
+    log = Log(system.state_names, system.control_names, tuple(pieces), left_out)
+    if samples.xdot is not None:
+        _check_logged_rates(log, system, owner)
+    return log
+
+
+def _remedy(samples: _Samples, unknown: int, held: bool) -> str:
+    """What makes pieces longer; `unknown` samples came without a control."""
+    n, holes = len(samples.t), int(np.isnan(samples.x).any(axis=1).sum())
+    if unknown > n / 4 and not held:
+        return (f"a control is missing in {unknown} of them: where it is logged only when it changes, pass "
+                "hold_controls=True (--hold-controls), else log it at every sample")
+    if np.isnan(samples.u).all():
+        return "no control is known: log it where it changes, and at the start"
+    if holes > n / 4:
+        return f"a state is missing in {holes} of them: log all states, or find the others by an observer first"
+    return "log at regular times, or raise max_gap"
+
+
+def _held(u: Array, run: list[str]) -> Array:
+    """Controls [N, nu] with each run's last known one in place of missing ones; missing before the first."""
+    found, last, before = u.copy(), np.full(u.shape[1], np.nan), ""
+    for k, label in enumerate(run):
+        last = np.where(np.isfinite(u[k]) | (label != before), u[k], last)
+        found[k], before = last, label
+    return found
+
+
+def _pieces(system: System, samples: _Samples, max_gap: float, owner: str) -> tuple[list[Recording], int]:
     """(the pieces without gaps, the number of samples left out)."""
     pieces, left_out = [], 0
-    _, first = np.unique(labels, return_index=True)
-    for label in labels[np.sort(first)]:
+    labels = np.array(samples.run)
+    for label in dict.fromkeys(samples.run):
         rows = np.flatnonzero(labels == label)
-        _check_times(t[rows], rows, f"{owner}, run {label}")
-        steps = np.diff(t[rows])
-        usual = float(np.median(steps)) if len(steps) else 0.0
-        known: Any = np.isfinite(arrays["u"][rows]).all(axis=1)  # the control of the last sample of a piece is not used
-        end = np.r_[~known[:-1] | (steps > max_gap * usual), True]
-        for part in np.split(rows, np.flatnonzero(end[:-1]) + 1):
-            piece = _piece(system, str(label), t, arrays, part)
+        _check_rising(samples.t[rows], rows, f"{owner}, run {label}")
+        for part in np.split(rows, _ends(samples, rows, max_gap, f"{owner}, run {label}")):
+            piece = _piece(system, label, samples, part, owner)
             if piece is None:
                 left_out += len(part)
             else:
@@ -192,7 +243,22 @@ def _pieces(system: System, t: Array, arrays: dict[str, Array], labels: Any, max
     return pieces, left_out
 
 
-def _check_times(t: Array, rows: Any, owner: str) -> None:
+def _ends(samples: _Samples, rows: Any, max_gap: float, owner: str) -> Any:
+    """Where a run's next piece begins: after a missing control (the last one of a piece is not used) or a gap."""
+    steps = np.diff(samples.t[rows])
+    if not len(steps):
+        return []
+    usual = float(np.median(steps))
+    check_times(samples.t[rows], usual, owner)
+    apart = steps > max_gap * usual
+    if samples.piece is not None:  # written by nocl: gaps are known
+        piece = [samples.piece[k] for k in rows]
+        apart = np.array([a != b for a, b in pairwise(piece)])
+    known = np.isfinite(samples.u[rows[:-1]]).all(axis=1)
+    return np.flatnonzero(apart | ~known) + 1
+
+
+def _check_rising(t: Array, rows: Any, owner: str) -> None:
     bad = np.flatnonzero(~np.isfinite(t))
     if bad.size:
         raise ValueError(f"{owner}: the time of sample {rows[bad[0]]} is {t[bad[0]]}; expected a number: drop that "
@@ -203,18 +269,25 @@ def _check_times(t: Array, rows: Any, owner: str) -> None:
                          "expected rising times: sort the samples, or name several recordings by `run`")
 
 
-def _piece(system: System, run: str, t: Array, arrays: dict[str, Array], rows: Any) -> Recording | None:
+def _piece(system: System, run: str, samples: _Samples, rows: Any, owner: str) -> Recording | None:
     """A piece, from its first to its last sample with a whole state; None where too little is left."""
-    whole = np.flatnonzero(np.isfinite(arrays["x"][rows]).all(axis=1))
+    whole = np.flatnonzero(np.isfinite(samples.x[rows]).all(axis=1))
     if not len(whole):
         return None
     rows = rows[whole[0]: whole[-1] + 1]
-    x, u = arrays["x"][rows].copy(), arrays["u"][rows[:-1]]
+    x = samples.x[rows].copy()
     if np.isfinite(x).sum(axis=0).min() < LEAST:
         return None
-    x[~np.isfinite(x)] = np.nan
     for i in system.angle_indices:
-        there = np.isfinite(x[:, i])
-        x[there, i] = np.unwrap(x[there, i])
-    xdot = arrays["xdot"][rows] if "xdot" in arrays else None
-    return Recording(run, t[rows], x, u, xdot)
+        x[:, i] = unwrapped(x[:, i], rows, system.state_names[i], f"{owner}, run {run}")
+    xdot = None if samples.xdot is None else samples.xdot[rows]
+    return Recording(run, samples.t[rows], x, samples.u[rows[:-1]], xdot)
+
+
+def _check_logged_rates(log: Log, system: System, owner: str) -> None:
+    """ValueError where logged derivatives are in other units than the states, or than time."""
+    for i, name in enumerate(log.states):
+        rates = [r.xdot[:, i] for r in log if r.xdot is not None]
+        for r, rate in zip(log, rates, strict=True):
+            check_rates(rate, r.t, system.lbx[i], system.ubx[i], name, owner)
+        check_rate([r.x[:, i] for r in log], rates, [r.t for r in log], name, f"its column d{name}/dt", owner)

@@ -14,31 +14,37 @@ Shapes: W windows, m steps, P parameters, theta in units that the caller chooses
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 import torch
 from torch import Tensor
-from torch.func import functional_call, jacrev, vmap
+from torch.func import functional_call
 
 from nocl.nets import FeatureNet
 from nocl.support.checks import Array
 from nocl.sysid.logs.derivatives import noise
-from nocl.sysid.logs.log import Log
+from nocl.sysid.logs.log import Log, Recording
+from nocl.sysid.logs.slopes import Slopes
+from nocl.sysid.settings import LogSettings
 from nocl.translate.rk4 import rk4_interval
 
 NOISE_FLOOR = 1e-3  # of a state's spread: logs without noise would weigh rounding
-CHUNK = 50  # windows whose sensitivities are held at a time
-REJECTIONS = 8  # of a step, before it is given up
+HELD = 2**23  # numbers of sensitivities that are held at a time
+REJECTIONS = 12  # of a step, before it is given up
+SHORTEST = 2  # steps of the first windows
+PATIENCE = 3  # steps that together have to take off this share of the loss: of windows to grow yet, of the last
+ENOUGH, LAST = 0.05, 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class Windows:
     """Pieces of runs of m steps; short ones are filled up with steps of length 0 that count for nothing."""
 
-    start: Tensor  # [W, nx], where simulations start: smoothed states at first
+    at: Sequence[tuple[int, int]]  # [W] of (run, sample), where in the log each one starts
+    start: Tensor  # [W, nx], where simulations start at first
     x: Tensor  # [W, m+1, nx], logged, 0 where missing
     there: Tensor  # [W, m+1, nx], 1 where logged
     u: Tensor  # [W, m, nu]
@@ -46,32 +52,37 @@ class Windows:
     noise: Tensor  # [nx], what residuals are measured in
 
     @staticmethod
-    def of(log: Log, m: int, most: int, rng: np.random.Generator) -> Windows:
-        """All windows of m steps of a log, or `most` of them at random."""
-        pieces = []
-        for run in log:
-            pieces += [_window(run.t, run.x, run.u, run.smooth.x, k, m) for k in range(0, len(run) - 1, m)]
-        if len(pieces) > most:
-            pieces = [pieces[i] for i in rng.permutation(len(pieces))[:most]]
-        start, x, u, h = (np.stack(p) for p in zip(*pieces, strict=True))
+    def of(log: Log, states: Sequence[Array], m: int, most: int, rng: np.random.Generator) -> Windows:
+        """All windows of m steps of a log, or `most` of them at random; starts are from each run's states [K+1, nx]."""
+        at = [(i, k) for i, run in enumerate(log) for k in range(0, len(run) - 1, m)]
+        if len(at) > most:
+            at = [at[i] for i in rng.permutation(len(at))[:most]]
+        pieces = [_window(log.runs[i], k, m) for i, k in at]
+        x, u, h = (np.stack(p) for p in zip(*pieces, strict=True))
+        start, there = np.stack([states[i][k] for i, k in at]), np.isfinite(x)
         sigma = np.hypot(noise(log), NOISE_FLOOR * spread_of(np.concatenate([r.smooth.x for r in log])))
-        there = np.isfinite(x)
         arrays = (start, np.where(there, x, 0.0), there.astype(float), u, h[..., None], sigma)
-        return Windows(*(torch.from_numpy(np.ascontiguousarray(a)) for a in arrays))
+        tensors = [torch.from_numpy(np.ascontiguousarray(a)) for a in arrays]
+        return Windows(tuple(at), *tensors)
 
     def __getitem__(self, rows: slice) -> Windows:
-        return Windows(self.start[rows], self.x[rows], self.there[rows], self.u[rows], self.h[rows], self.noise)
+        return Windows(self.at[rows], self.start[rows], self.x[rows], self.there[rows], self.u[rows], self.h[rows],
+                       self.noise)
 
     def __len__(self) -> int:
         return len(self.start)
 
-    def residuals(self, f: Callable[[Tensor, Tensor], Tensor], start: Tensor, substeps: int) -> Tensor:
-        """r [W, m+1, nx] of simulations from start [W, nx]."""
+    def paths(self, f: Callable[[Tensor, Tensor], Tensor], start: Tensor, substeps: int) -> Tensor:
+        """Simulations from start [W, nx]: [W, m+1, nx]."""
         x, path = start, [start]
         for k in range(self.u.shape[1]):
             x = rk4_interval(f, x, self.u[:, k], self.h[:, k], substeps)
             path.append(x)
-        return (torch.stack(path, 1) - self.x) * self.there / self.noise
+        return torch.stack(path, 1)
+
+    def residuals(self, paths: Tensor) -> Tensor:
+        """r [W, m+1, nx] of simulations."""
+        return (paths - self.x) * self.there / self.noise
 
 
 def spread_of(values: Array) -> Array:
@@ -80,13 +91,13 @@ def spread_of(values: Array) -> Array:
     return np.where(spread > 1e-12 * np.abs(values).max(axis=0), spread, 1.0)
 
 
-def _window(t: Array, x: Array, u: Array, smoothed: Array, k: int, m: int) -> tuple[Array, Array, Array, Array]:
-    """(start, logged states, controls, steps) of the window from sample k on, filled up to m steps."""
-    n = min(m, len(t) - 1 - k)
-    states, controls, h = np.full((m + 1, x.shape[1]), np.nan), np.zeros((m, u.shape[1])), np.zeros(m)
-    states[: n + 1], controls[:n], h[:n] = x[k: k + n + 1], u[k: k + n], np.diff(t[k: k + n + 1])
-    controls[n:] = u[k + n - 1]
-    return smoothed[k], states, controls, h
+def _window(run: Recording, k: int, m: int) -> tuple[Array, Array, Array]:
+    """(logged states, controls, steps) of the window from sample k on, filled up to m steps."""
+    n = min(m, len(run) - 1 - k)
+    states, controls, h = np.full((m + 1, run.x.shape[1]), np.nan), np.zeros((m, run.u.shape[1])), np.zeros(m)
+    states[: n + 1], controls[:n], h[:n] = run.x[k: k + n + 1], run.u[k: k + n], np.diff(run.t[k: k + n + 1])
+    controls[n:] = run.u[k + n - 1]
+    return states, controls, h
 
 
 @dataclass(eq=False)
@@ -97,13 +108,14 @@ class _Problem:
     unit: Tensor  # [P]
     windows: Windows
     substeps: int
-    ridge: float  # times the sum of squared theta, beside the sum of squared residuals over their number
+    given_ridge: float | None  # times the sum of squared theta, beside the mean of squared residuals
 
     def __post_init__(self) -> None:
         self.names = [name for name, _ in self.net.named_parameters()]
         self.shapes = [p.shape for p in self.net.parameters()]
         self.count = float(self.windows.there.sum())
-        self.both = vmap(jacrev(self._one, argnums=(0, 1)), in_dims=(None, 0, 0))
+        self.ridge = 1 / self.count if self.given_ridge is None else self.given_ridge
+        self.slopes = Slopes(self.net)
 
     def tensors(self, theta: Tensor) -> dict[str, Tensor]:
         sizes = [s.numel() for s in self.shapes]
@@ -113,19 +125,17 @@ class _Problem:
         tensors = self.tensors(theta)
         return lambda x, u: functional_call(self.net, tensors, (x, u))
 
-    def _one(self, theta: Tensor, x: Tensor, u: Tensor) -> Tensor:
-        return functional_call(self.net, self.tensors(theta), (x[None], u[None]))[0]
-
     def loss(self, theta: Tensor, start: Tensor) -> float:
         """Mean square of r, plus the ridge."""
         with torch.no_grad():
-            r = self.windows.residuals(self.f(theta), start, self.substeps)
+            r = self.windows.residuals(self.windows.paths(self.f(theta), start, self.substeps))
             return float(r.square().sum()) / self.count + self.ridge * float(theta @ theta)
 
     def normal(self, theta: Tensor, start: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """(J'J [P, P], J'r [P]), starts projected out, and a [W, nx], A [W, nx, P]: starts move a + A dtheta."""
         JJ, Jr, a, A = torch.zeros(len(theta), len(theta), dtype=theta.dtype), torch.zeros_like(theta), [], []
-        for first, last in pairwise([*range(0, len(start), CHUNK), len(start)]):
+        chunk = max(HELD // (self.windows.x[0].numel() * len(theta)), 1)
+        for first, last in pairwise([*range(0, len(start), chunk), len(start)]):
             R, D, r = self.sensitivities(theta, self.windows[first:last], start[first:last])
             Q, T = torch.linalg.qr(D)  # [w, rows, nx], [w, nx, nx]
             QR, Qr = Q.transpose(1, 2) @ R, Q.transpose(1, 2) @ r[..., None]
@@ -158,40 +168,94 @@ class _Problem:
 
     def _step(self, theta: Tensor, x: Tensor, u: Tensor, h: Tensor, S: Tensor) -> tuple[Tensor, Tensor]:
         """One RK4 step and its derivative by (theta, start)."""
-        f, P, hh = self.f(theta), len(theta), h[..., None]
+        parameters, P, hh = list(self.tensors(theta).values()), len(theta), h[..., None]
         with torch.no_grad():
             k, dk, total, slope = torch.zeros_like(x), torch.zeros_like(S), torch.zeros_like(x), torch.zeros_like(S)
             for c, weight in ((0.0, 1.0), (0.5, 2.0), (0.5, 2.0), (1.0, 1.0)):
                 at, moved = x + c * h * k, S + c * hh * dk
-                by_theta, by_x = self.both(theta, at, u)
-                k, dk = f(at, u), by_x @ moved
-                dk[..., :P] += by_theta
+                k, by_theta, by_x = self.slopes(parameters, at, u)
+                dk = by_x @ moved
+                dk[..., :P] += by_theta * self.unit
                 total, slope = total + weight * k, slope + weight * dk
             return x + h / 6 * total, S + hh / 6 * slope
 
+    def minimise(self, theta: Tensor, steps: int, enough: float,
+                 report: Callable[[float], None]) -> tuple[Tensor, Tensor, Stage]:
+        """(theta, starts) after at most so many damped Gauss-Newton steps, until PATIENCE of them together take off
+        less than a share of `enough`, or none helps."""
+        start, damping = self.windows.start, 1e-3
+        seen = [self.loss(theta, start)]
+        while len(seen) <= steps:
+            JJ, Jr, a, A = self.normal(theta, start)
+            gradient = Jr + self.ridge * theta
+            for _ in range(REJECTIONS):
+                factor, info = torch.linalg.cholesky_ex(JJ + torch.diag(damping * JJ.diagonal() + self.ridge + 1e-14))
+                if not int(info):
+                    step = -torch.cholesky_solve(gradient[:, None], factor)[:, 0]
+                    moved = theta + step, start + a + A @ step
+                    after = self.loss(*moved)
+                    if after < seen[-1]:
+                        break
+                damping *= 5
+            else:
+                break
+            (theta, start), damping = moved, max(0.1 * damping, 1e-9)
+            seen.append(after)
+            report(after**0.5)
+            if len(seen) > PATIENCE and after > (1 - enough) * seen[-1 - PATIENCE]:
+                break
+        return theta, start, Stage(self.windows.u.shape[1], seen[0]**0.5, seen[-1]**0.5, len(seen) - 1)
 
-def fit_simulation(net: FeatureNet, unit: Array, windows: Windows, *, steps: int, substeps: int, ridge: float,
-                   report: Callable[[float], None]) -> None:
-    """Gauss-Newton steps on the windows' residuals; changes the network. `report`: root mean square residual."""
-    scale = torch.from_numpy(unit)
+    def put(self, states: Sequence[Array], theta: Tensor, start: Tensor) -> None:
+        """Write the simulated states of the windows into each run's [K+1, nx]."""
+        with torch.no_grad():
+            paths = self.windows.paths(self.f(theta), start, self.substeps).numpy()
+        for (run, k), path in zip(self.windows.at, paths, strict=True):
+            own = states[run][k: k + len(path)]
+            own[:] = path[: len(own)]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """What Gauss-Newton steps on windows of one length came to."""
+
+    steps: int  # of a window
+    first: float  # root mean square residual before
+    last: float  # and after
+    taken: int  # steps that lowered it
+
+    @property
+    def failed(self) -> bool:
+        """No step helped, and the residuals are not down to the noise."""
+        return not self.taken and not self.last <= 1
+
+
+def lengths(window: int, log: Log) -> list[int]:
+    """Windows of 2 steps, then twice as many at a time, up to `window` or the longest run."""
+    longest = min(window, max(map(len, log)) - 1)
+    halved = [longest]
+    while halved[-1] >= 2 * SHORTEST:
+        halved.append(halved[-1] // 2)
+    return halved[::-1]
+
+
+def fit_simulation(net: FeatureNet, unit: Array, log: Log, settings: LogSettings, rng: np.random.Generator,
+                   report: Callable[[float], None]) -> list[Stage]:
+    """Gauss-Newton steps on windows that grow as long as they succeed; changes the network.
+
+    A short window has a minimum that can be reached from afar, even where the plant is unstable or smoothing was poor;
+    its minimum, weights and states, is where the next one starts. `report`: root mean square residual of each step.
+    """
+    scale, states = torch.from_numpy(unit), [run.smooth.x.copy() for run in log]
     theta = torch.nn.utils.parameters_to_vector(net.parameters()).detach() / scale
-    problem = _Problem(net, scale, windows, substeps, ridge)
-    start, damping = windows.start, 1e-3
-    before = problem.loss(theta, start)
-    for _ in range(steps):
-        JJ, Jr, a, A = problem.normal(theta, start)
-        gradient, former = Jr + ridge * theta, before
-        for _ in range(REJECTIONS):
-            factor, info = torch.linalg.cholesky_ex(JJ + torch.diag(damping * JJ.diagonal() + ridge + 1e-14))
-            if not int(info):
-                step = -torch.cholesky_solve(gradient[:, None], factor)[:, 0]
-                moved = theta + step, start + a + A @ step
-                after = problem.loss(*moved)
-                if after < before:
-                    (theta, start), before, damping = moved, after, max(0.1 * damping, 1e-9)
-                    break
-            damping = min(5 * damping, 1e6)
-        report(before**0.5)
-        if before > former * (1 - 1e-4):
+    stages: list[Stage] = []
+    for m in (all_lengths := lengths(settings.window, log)):
+        most = settings.windows * settings.window // m  # as many samples
+        problem = _Problem(net, scale, Windows.of(log, states, m, most, rng), settings.substeps, settings.ridge)
+        theta, start, stage = problem.minimise(theta, settings.steps, LAST if m == all_lengths[-1] else ENOUGH, report)
+        stages.append(stage)
+        if stage.failed:
             break
+        problem.put(states, theta, start)
     torch.nn.utils.vector_to_parameters(theta * scale, net.parameters())
+    return stages

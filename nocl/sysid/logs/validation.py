@@ -44,11 +44,16 @@ class Validation:
         """The error of each horizon in units of the states' spread, root mean square over states [H]."""
         return np.sqrt(np.square(self.rms / self.spread).mean(axis=1))
 
+    @property
+    def still_relative(self) -> Array:
+        """The same of the prediction that nothing moves [H]."""
+        return np.sqrt(np.square(self.still / self.spread).mean(axis=1))
+
     def __str__(self) -> str:
         head = ["steps", "time", *self.states, "of spread", "standing still"]
-        still = np.sqrt(np.square(self.still / self.spread).mean(axis=1))
         rows = [[f"{k}", f"{s:.3g}", *(f"{e:.3g}" for e in rms), f"{100 * r:.3g} %", f"{100 * q:.3g} %"]
-                for k, s, rms, r, q in zip(self.steps, self.seconds, self.rms, self.relative, still, strict=True)]
+                for k, s, rms, r, q in zip(self.steps, self.seconds, self.rms, self.relative, self.still_relative,
+                                           strict=True)]
         widths = [max(map(len, column)) for column in zip(head, *rows, strict=True)]
         lines = ["  ".join(cell.rjust(w) for cell, w in zip(row, widths, strict=True)) for row in (head, *rows)]
         if self.blown.any():
