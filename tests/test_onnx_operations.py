@@ -114,7 +114,7 @@ def clip(kind: str, version: int, rng: Any) -> list[Any]:
 def where(kind: str, version: int, rng: Any) -> list[Any]:
     x, y = pairs(kind, rng)
     condition = rng.random(x.shape) > 0.5
-    return [([condition, x, y], {}), ([condition.view(Weight), x, y[:, :1]], {}), ([condition[:, :1], x, y], {})]
+    return [([condition, x, y], {}), ([condition.view(Fixed), x, y[:, :1]], {}), ([condition[:, :1], x, y], {})]
 
 
 def casts(kind: str, version: int, rng: Any) -> list[Any]:
@@ -333,27 +333,39 @@ def kinds(op: str, version: int) -> str:
     return "".join(k for k in "fib" if (k in RULES[op].kinds or RULES[op].kinds == "*") and spelled[k] in formal.types)
 
 
-def built(op: str, version: int, args: list[Any], options: dict[str, Any], dynamic: bool) -> Any:
-    """A model of the one operation. Inputs come in as rows of reals, and are given their shape and type."""
-    options = dict(options)
-    outputs = [f"y{i}" for i in range(options.pop("outputs", 1))]
-    nodes, inputs, constants, names = [], [], [], []
-    for i, a in enumerate(args):
-        names.append("" if a is None else f"a{i}")
-        if a is None:
-            continue
-        if isinstance(a, Fixed) or not dynamic:
-            constants.append(onnx.numpy_helper.from_array(np.asarray(a), f"a{i}"))
-        else:
-            element = helper.np_dtype_to_tensor_dtype(a.dtype)
-            real = element if a.dtype.kind == "f" else Kind.FLOAT
-            inputs.append(helper.make_tensor_value_info(f"x{i}", real, [a.size]))
-            constants.append(onnx.numpy_helper.from_array(np.array(a.shape, np.int64), f"shape{i}"))
-            nodes += [helper.make_node("Reshape", [f"x{i}", f"shape{i}"], [f"r{i}"]),
-                      helper.make_node("Cast", [f"r{i}"], [f"a{i}"], to=element)]
-    nodes.append(helper.make_node(op, names, outputs, **options))
-    graph = helper.make_graph(nodes, "g", inputs, [helper.make_empty_tensor_value_info(o) for o in outputs], constants)
-    return helper.make_model(graph, opset_imports=[helper.make_opsetid("", version)], ir_version=10)
+class Graph:
+    """A model of one operation, a node for each case. Inputs come in as rows of reals, and are given shape and type."""
+
+    def __init__(self, dynamic: bool) -> None:
+        self.dynamic, self.rows = dynamic, []
+        self.nodes, self.inputs, self.constants, self.outputs = [], [], [], []
+
+    def add(self, op: str, args: list[Any], options: dict[str, Any]) -> None:
+        options = dict(options)
+        names = ["" if a is None else self.argument(a) for a in args]
+        outputs = [f"y{len(self.outputs) + i}" for i in range(options.pop("outputs", 1))]
+        self.outputs += outputs
+        self.nodes.append(helper.make_node(op, names, outputs, **options))
+
+    def argument(self, a: Any) -> str:
+        if isinstance(a, Fixed) or not self.dynamic:
+            return self.constant(np.asarray(a))
+        k, element = len(self.inputs), helper.np_dtype_to_tensor_dtype(a.dtype)
+        real = element if a.dtype.kind == "f" else Kind.FLOAT
+        self.inputs.append(helper.make_tensor_value_info(f"x{k}", real, [a.size]))
+        self.rows.append(a.ravel() if a.dtype.kind == "f" else a.ravel().astype(np.float32))
+        self.nodes += [helper.make_node("Reshape", [f"x{k}", self.constant(np.array(a.shape, np.int64))], [f"r{k}"]),
+                       helper.make_node("Cast", [f"r{k}"], [f"a{k}"], to=element)]
+        return f"a{k}"
+
+    def constant(self, value: Any) -> str:
+        self.constants.append(onnx.numpy_helper.from_array(value, f"c{len(self.constants)}"))
+        return self.constants[-1].name
+
+    def model(self, version: int) -> Any:
+        ends = [helper.make_empty_tensor_value_info(o) for o in self.outputs]
+        graph = helper.make_graph(self.nodes, "g", self.inputs, ends, self.constants)
+        return helper.make_model(graph, opset_imports=[helper.make_opsetid("", version)], ir_version=10)
 
 
 def runtime(model: Any, rows: list[Any]) -> list[Any] | None:
@@ -374,12 +386,6 @@ def typed(args: list[Any], kind: str, dtype: Any) -> list[Any]:
     """The numbers of this kind in one of its types, weights too; shapes and axes stay."""
     return [a if a is None or type(a) is Fixed or (a.dtype.kind != kind and not isinstance(a, Weight)) else
             a.astype(dtype) for a in args]
-
-
-def flat(args: list[Any]) -> list[Any]:
-    """What built() has as inputs."""
-    there = [np.asarray(a).ravel() for a in args if a is not None and not isinstance(a, Fixed)]
-    return [a if a.dtype.kind == "f" else a.astype(np.float32) for a in there]
 
 
 def same(path: Any, model: Any, expected: list[Any], rows: list[Any], single: bool) -> None:
@@ -403,14 +409,15 @@ def same(path: Any, model: Any, expected: list[Any], rows: list[Any], single: bo
 def test_each_operation_equals_onnx_runtime(tmp_path, op, version, kind):
     compared, newest = 0, version == versions(op)[-1]
     for dtype in TYPES[kind] if newest else TYPES[kind][-1:] if kind == "i" else TYPES[kind][:1]:
-        for args, options in CASES[op](kind, version, np.random.default_rng(zlib.crc32(op.encode()))):
-            args = typed(args, kind, dtype)
-            for dynamic in (True, False) if newest else (True,):
-                model, rows = built(op, version, args, options, dynamic), flat(args) if dynamic else []
-                expected = runtime(model, rows)
-                if expected is not None:
-                    same(tmp_path / "g.onnx", model, expected, rows, dtype is np.float32 or op == "Gelu")
-                    compared += 1
+        for dynamic in (True, False) if newest else (True,):
+            graph = Graph(dynamic)
+            for args, options in CASES[op](kind, version, np.random.default_rng(zlib.crc32(op.encode()))):
+                graph.add(op, typed(args, kind, dtype), options)
+            model = graph.model(version)
+            expected = runtime(model, graph.rows)
+            if expected is not None:
+                same(tmp_path / "g.onnx", model, expected, graph.rows, dtype is np.float32 or op == "Gelu")
+                compared += 1
     assert compared, f"ONNX Runtime has no {op} of opset {version} for {kind}"
 
 
