@@ -9,9 +9,9 @@ import torch
 from nocl.sysid.from_log import initial
 from nocl.sysid.labels import box_of
 from nocl.sysid.logs.log import Log
+from nocl.sysid.logs.settings import LogSettings
 from nocl.sysid.logs.shooting import Stage, Windows, _Problem, lengths
 from nocl.sysid.networks import assemble
-from nocl.sysid.settings import LogSettings
 from nocl.sysid.stated import Stated
 from nocl.systems import pendulum
 

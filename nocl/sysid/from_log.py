@@ -18,10 +18,10 @@ from nocl.support.checks import Array
 from nocl.sysid import fitting
 from nocl.sysid.logs.derivatives import labels
 from nocl.sysid.logs.log import Log, Recording
+from nocl.sysid.logs.settings import LogSettings
 from nocl.sysid.logs.shooting import Stage, fit_simulation, lengths, spread_of
 from nocl.sysid.networks import assemble
 from nocl.sysid.progress import Progress
-from nocl.sysid.settings import LogSettings
 from nocl.sysid.structure import Structure
 
 MEMORY = 30  # of L-BFGS

@@ -36,14 +36,14 @@ from nocl.sysid.from_log import first_states, fit_log
 from nocl.sysid.labels import Source, box_of, data_box, find_structure, labelled, rows_of, some_labels
 from nocl.sysid.logs.coverage import Coverage, share_of_nodes
 from nocl.sysid.logs.log import Log
+from nocl.sysid.logs.settings import LogSettings
 from nocl.sysid.logs.shooting import Stage
 from nocl.sysid.logs.validation import HORIZONS, Validation, validate
 from nocl.sysid.networks import assemble, fit_group, fit_groups, weights_of
 from nocl.sysid.progress import Checkpoint, Progress
-from nocl.sysid.score import Score, contradictions, score_of
-from nocl.sysid.settings import LogSettings, PaperSettings, Settings
+from nocl.sysid.score import Score, contradictions, contradictions_of, score_of
+from nocl.sysid.settings import PaperSettings, Settings
 from nocl.sysid.stated import Known, Stated
-from nocl.sysid.stated_in_log import contradictions_of
 from nocl.sysid.structure import Box, Expansion, Group, Split, Structure
 from nocl.sysid.trial import better_affine
 from nocl.system import System

@@ -27,8 +27,8 @@ from nocl.nets import FeatureNet
 from nocl.support.checks import Array
 from nocl.sysid.logs.derivatives import noise
 from nocl.sysid.logs.log import Log, Recording
+from nocl.sysid.logs.settings import LogSettings
 from nocl.sysid.logs.slopes import Slopes
-from nocl.sysid.settings import LogSettings
 from nocl.translate.rk4 import rk4_interval
 
 NOISE_FLOOR = 1e-3  # of a state's spread: logs without noise would weigh rounding
