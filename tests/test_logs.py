@@ -176,7 +176,7 @@ def test_a_linear_system_from_noisy_logs(model):
     np.testing.assert_allclose(fitted, [-4, -0.4, 1], atol=0.25)  # off by 0.02 to 0.11, by the log's noise
     A_B = np.hstack([A, B])
     error = model(x, u).numpy() - z @ A_B.T
-    assert np.sqrt(np.square(error).mean()) < 0.1 * (z @ A_B.T).std()
+    assert np.sqrt(np.square(error).mean()) < 0.2 * (z @ A_B.T).std()  # 0.02 to 0.07 of it
 
 
 def test_simulation_error_beats_derivatives(log, model):

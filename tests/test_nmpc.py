@@ -107,7 +107,7 @@ def test_the_known_optimum_and_the_judge():
 
 def test_several_starts_find_what_one_misses():
     ocp = nocl.load_ocp("cartpole")
-    x0 = np.random.default_rng(0).uniform(-1, 1, (4, 4)) * BOX
+    x0 = np.random.default_rng(0).uniform(-1, 1, (12, 4)) * BOX  # one start misses 4 to 8 of 12
     one, many = (NMPC(ocp, 40, starts=n, passes=0).solve(x0) for n in (1, 8))
     assert many.success.all()
     assert (many.cost <= one.cost + 1e-9).all()
