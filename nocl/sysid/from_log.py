@@ -43,7 +43,9 @@ def fit_log(log: Log, parts: Structure, settings: LogSettings, seed: int,
     if settings.steps:
         total = settings.steps * len(lengths(settings.window, log))
         with bar.stage("simulation error", total) as report:
-            stages = fit_simulation(net, unit, log, settings, np.random.default_rng((seed, 3)), report)
+            stages = fit_simulation(net, unit, log, window=settings.window, windows=settings.windows,
+                                    steps=settings.steps, substeps=settings.substeps, ridge=settings.ridge,
+                                    rng=np.random.default_rng((seed, 3)), report=report)
     if not all(torch.isfinite(p).all() for p in net.parameters()):
         raise ValueError("identify: the fit to the log is not finite; expected numbers of ordinary size: look for "
                          "outliers, or scale states, controls and time")

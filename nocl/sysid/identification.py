@@ -35,6 +35,7 @@ from nocl.sysid.figures import slices
 from nocl.sysid.from_log import first_states, fit_log
 from nocl.sysid.labels import Source, box_of, data_box, find_structure, labelled, rows_of, some_labels
 from nocl.sysid.logs.coverage import Coverage, share_of_nodes
+from nocl.sysid.logs.known_rows import contradictions_of
 from nocl.sysid.logs.log import Log
 from nocl.sysid.logs.shooting import Stage
 from nocl.sysid.logs.validation import HORIZONS, Validation, validate
@@ -43,7 +44,6 @@ from nocl.sysid.progress import Checkpoint, Progress
 from nocl.sysid.score import Score, contradictions, score_of
 from nocl.sysid.settings import LogSettings, PaperSettings, Settings
 from nocl.sysid.stated import Known, Stated
-from nocl.sysid.stated_in_log import contradictions_of
 from nocl.sysid.structure import Box, Expansion, Group, Split, Structure
 from nocl.sysid.trial import better_affine
 from nocl.system import System
@@ -247,7 +247,7 @@ def _from_log(system: System, log: Log, stated: Stated, settings: LogSettings, s
     log.check(system)
     start = time.perf_counter()
     parts = stated.plain(data_box(system, np.vstack([np.hstack([s, r.u]) for s, r in first_states(log)])))
-    said = contradictions_of(log, stated)
+    said = contradictions_of(log, stated.z, stated.rows)
     net, stages = fit_log(log, parts, settings, seed, bar)
     seen = validate(net, log, (1, min(settings.window, max(map(len, log)) - 1)), substeps=settings.substeps)
     _warn_of(said, "log speaks", 5)

@@ -80,8 +80,8 @@ class LogSettings(Scaled):
 
     width: int = count(32, "of the two hidden layers")
     iterations: int = count(300, "of L-BFGS on derivatives", least=0)
-    steps: int = count(20, "Gauss-Newton steps on simulation error, at most, for each length of windows; 0: derivatives "
-                       "alone", least=0)
+    steps: int = count(20, "Gauss-Newton steps on simulation error, at most, for each length of windows; 0: "
+                       "derivatives alone", least=0)
     window: int = count(40, "steps that are simulated in one go in the end: windows start with 2, and grow")
     windows: int = count(1000, "of that length, at most, drawn at random beyond")
     substeps: int = count(1, "RK4 steps between two samples")

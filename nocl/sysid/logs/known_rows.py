@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import casadi as ca
 import numpy as np
@@ -10,21 +10,20 @@ import numpy as np
 from nocl.support.checks import Array
 from nocl.sysid.logs.log import Log
 from nocl.sysid.logs.plausible import check_rate
-from nocl.sysid.stated import Stated
 
 SIGMAS = 3.0  # times what noise explains
 LARGEST = 1e100  # of a rate: squares must not overflow
 COARSE = 0.25  # of how far a rate moves in a step: what the trapezoidal rule may miss, and no more than half
 
 
-def contradictions_of(log: Log, stated: Stated) -> list[str]:
-    """What the log's own steps say against stated rows, in words.
+def contradictions_of(log: Log, z: ca.SX, known: Mapping[int, ca.SX]) -> list[str]:
+    """What the log's own steps say against known rows of xdot, expressions in z = (x, u), in words.
 
     Raises ValueError where a row is right but for a factor: a unit is wrong then.
     """
     said = []
-    for i, row in stated.rows.items():
-        name, rate = log.states[i], _rows(ca.Function("row", [stated.z], [row]))
+    for i, row in known.items():
+        name, rate = log.states[i], _rows(ca.Function("row", [z], [row]))
         x, t = [r.x[:, i] for r in log], [r.t for r in log]
         last = [np.vstack([r.u, r.u[-1:]]) for r in log]
         rates = [rate(r.x, u) for r, u in zip(log, last, strict=True)]
