@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import nocl
-from nocl.cli import main, run_folder
+from nocl.cli import main
 from nocl.sysid import LogSettings, identify
 from nocl.sysid.logs.log import Log
 
@@ -83,7 +83,7 @@ def test_numbers_whose_squares_overflow_are_refused_in_any_box(unit):
 
 @pytest.mark.parametrize("factor", [40.0, 1e-8])
 def test_odd_scales_are_warned_of(factor):
-    with pytest.warns(UserWarning, match="omega .* is it in another unit"):
+    with pytest.warns(UserWarning, match=r"omega .* in another unit"):
         Log.of(plant(), T, X * [1, factor], U)
 
 
@@ -459,7 +459,7 @@ ocp = nocl.OCP.quadratic(plant, horizon=2.0, x_goal=[0, 0], u_goal=[0], R=0.1,
 @pytest.fixture
 def here(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(run_folder, "QUICK_LOG", FAST)
+    monkeypatch.setattr(LogSettings, "EFFORT", {"quick": {"width": 4, "iterations": 10, "steps": 1, "window": 4}})
     (tmp_path / "plant.py").write_text(PROBLEM)
     return tmp_path
 

@@ -9,9 +9,9 @@ import torch
 from nocl.sysid.from_log import initial
 from nocl.sysid.labels import box_of
 from nocl.sysid.logs.log import Log
-from nocl.sysid.logs.settings import LogSettings
 from nocl.sysid.logs.shooting import Stage, Windows, _Problem, lengths
 from nocl.sysid.networks import assemble
+from nocl.sysid.settings import LogSettings
 from nocl.sysid.stated import Stated
 from nocl.systems import pendulum
 
@@ -84,7 +84,7 @@ def test_each_step_lowers_the_error():
     p, seen = problem(ridge=1e-6), []
     theta, start, stage = p.minimise(theta_of(p), 8, 1e-4, seen.append)
     assert seen == sorted(seen, reverse=True)
-    assert stage.last == seen[-1] < stage.first  # by how much is up to the noise
+    assert stage.last == seen[-1] < 0.8 * stage.first
     assert stage.taken == len(seen)
     assert p.loss(theta, start) ** 0.5 == pytest.approx(stage.last, rel=1e-12)
     assert not stage.failed

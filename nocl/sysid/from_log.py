@@ -17,11 +17,11 @@ from nocl.nets import MLP, FeatureNet
 from nocl.support.checks import Array
 from nocl.sysid import fitting
 from nocl.sysid.logs.derivatives import labels
-from nocl.sysid.logs.log import Log, Recording
-from nocl.sysid.logs.settings import LogSettings
+from nocl.sysid.logs.log import Log, Run
 from nocl.sysid.logs.shooting import Stage, fit_simulation, lengths, spread_of
 from nocl.sysid.networks import assemble
 from nocl.sysid.progress import Progress
+from nocl.sysid.settings import LogSettings
 from nocl.sysid.structure import Structure
 
 MEMORY = 30  # of L-BFGS
@@ -43,14 +43,16 @@ def fit_log(log: Log, parts: Structure, settings: LogSettings, seed: int,
     if settings.steps:
         total = settings.steps * len(lengths(settings.window, log))
         with bar.stage("simulation error", total) as report:
-            stages = fit_simulation(net, unit, log, settings, np.random.default_rng((seed, 3)), report)
+            stages = fit_simulation(net, unit, log, window=settings.window, windows=settings.windows,
+                                    steps=settings.steps, substeps=settings.substeps, ridge=settings.ridge,
+                                    rng=np.random.default_rng((seed, 3)), report=report)
     if not all(torch.isfinite(p).all() for p in net.parameters()):
         raise ValueError("identify: the fit to the log is not finite; expected numbers of ordinary size: look for "
                          "outliers, or scale states, controls and time")
     return net.requires_grad_(False), stages
 
 
-def first_states(log: Log) -> list[tuple[Array, Recording]]:
+def first_states(log: Log) -> list[tuple[Array, Run]]:
     """Each run with its smoothed states at all samples but the last."""
     return [(run.smooth.x[:-1], run) for run in log]
 

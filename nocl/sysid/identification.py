@@ -35,14 +35,14 @@ from nocl.sysid.figures import slices
 from nocl.sysid.from_log import first_states, fit_log
 from nocl.sysid.labels import Source, box_of, data_box, find_structure, labelled, rows_of, some_labels
 from nocl.sysid.logs.coverage import Coverage, share_of_nodes
+from nocl.sysid.logs.known_rows import contradictions_of
 from nocl.sysid.logs.log import Log
-from nocl.sysid.logs.settings import LogSettings
 from nocl.sysid.logs.shooting import Stage
 from nocl.sysid.logs.validation import HORIZONS, Validation, validate
 from nocl.sysid.networks import assemble, fit_group, fit_groups, weights_of
 from nocl.sysid.progress import Checkpoint, Progress
-from nocl.sysid.score import Score, contradictions, contradictions_of, score_of
-from nocl.sysid.settings import PaperSettings, Settings
+from nocl.sysid.score import Score, contradictions, score_of
+from nocl.sysid.settings import LogSettings, PaperSettings, Settings
 from nocl.sysid.stated import Known, Stated
 from nocl.sysid.structure import Box, Expansion, Group, Split, Structure
 from nocl.sysid.trial import better_affine
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 __all__ = ["LearnedDynamics", "LogSettings", "PaperSettings", "Score", "Settings", "identify"]
 
-RECIPES = ("default", "mlp", "paper")
+METHODS = ("default", "mlp", "paper")
 KIND = "dynamics"
 NO_BETTER = 0.5  # of the error of standing still: a model of a log that is warned of
 
@@ -176,8 +176,7 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
     Parameters
     ----------
     system : System
-        Gives labels at samples of its box: f and its Jacobians, asked at single points. Equations themselves are read
-        only where `known` names rows. With `data`, training takes names, boxes
+        Answers for labels at samples of its box; its equations are never read. With `data`, training takes names, boxes
         and angles from it only, and its equations may be unknown (xdot=None). The score on the card compares with
         them where they are known; for a Log, it is of simulations on that log.
     data : Dataset or Log
@@ -248,7 +247,7 @@ def _from_log(system: System, log: Log, stated: Stated, settings: LogSettings, s
     log.check(system)
     start = time.perf_counter()
     parts = stated.plain(data_box(system, np.vstack([np.hstack([s, r.u]) for s, r in first_states(log)])))
-    said = contradictions_of(log, stated)
+    said = contradictions_of(log, stated.z, stated.rows)
     net, stages = fit_log(log, parts, settings, seed, bar)
     seen = validate(net, log, (1, min(settings.window, max(map(len, log)) - 1)), substeps=settings.substeps)
     _warn_of(said, "log speaks", 5)
@@ -289,8 +288,8 @@ def _check_arguments(system: System, method: str, settings: Settings | PaperSett
     if not isinstance(system, System):
         raise ValueError(f"identify: system is a {type(system).__name__}; expected a nocl.System: "
                          "of an OCP, pass ocp.system")
-    if method not in RECIPES:
-        raise ValueError(f"identify: method is {method!r}; expected one of {', '.join(RECIPES)}")
+    if method not in METHODS:
+        raise ValueError(f"identify: method is {method!r}; expected one of {', '.join(METHODS)}")
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise ValueError(f"identify: seed is {seed!r}; expected an integer >= 0")
     if isinstance(data, Log) and method != "default":

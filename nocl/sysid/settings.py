@@ -33,7 +33,7 @@ class Budget:
 
     @staticmethod
     def plain(variables: int) -> Budget:
-        """Of one plain network of many variables with Jacobian labels (nocl.sysid.plain), one to two minutes."""
+        """Of one plain network of many variables with Jacobian labels (nocl.sysid_plain), one to two minutes."""
         return Budget(96 if variables <= 6 else 128, 15_000, 512, 0, 512)
 
 
@@ -68,6 +68,27 @@ class Settings(Scaled):
         own = {name: getattr(self, name) for name in Budget.__dataclass_fields__}
         default = Budget.plain(variables) if plain else Budget.of(variables)
         return replace(default, **{name: value for name, value in own.items() if value is not None})
+
+
+@dataclass(frozen=True)
+class LogSettings(Scaled):
+    """Of identification from logged trajectories."""
+
+    EFFORT: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "quick": {"width": 12, "iterations": 60, "steps": 3, "window": 20},
+        "best": {"iterations": 600, "steps": 60, "windows": 3000}}
+
+    width: int = count(32, "of the two hidden layers")
+    iterations: int = count(300, "of L-BFGS on derivatives", least=0)
+    steps: int = count(20, "Gauss-Newton steps on simulation error, at most, for each length of windows; 0: "
+                       "derivatives alone", least=0)
+    window: int = count(40, "steps that are simulated in one go in the end: windows start with 2, and grow")
+    windows: int = count(1000, "of that length, at most, drawn at random beyond")
+    substeps: int = count(1, "RK4 steps between two samples")
+    ridge: float | None = nonnegative(None, "times the sum of squared weights, beside the mean of squared residuals",
+                                      none="one over the number of residuals, the most probable weights where those of "
+                                      "a standard normal distribution are expected")
+    angles: bool = flag(True, "networks see angles as sin and cos")
 
 
 @dataclass(frozen=True)

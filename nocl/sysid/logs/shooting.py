@@ -26,8 +26,7 @@ from torch.func import functional_call
 from nocl.nets import FeatureNet
 from nocl.support.checks import Array
 from nocl.sysid.logs.derivatives import noise
-from nocl.sysid.logs.log import Log, Recording
-from nocl.sysid.logs.settings import LogSettings
+from nocl.sysid.logs.log import Log, Run
 from nocl.sysid.logs.slopes import Slopes
 from nocl.translate.rk4 import rk4_interval
 
@@ -91,7 +90,7 @@ def spread_of(values: Array) -> Array:
     return np.where(spread > 1e-12 * np.abs(values).max(axis=0), spread, 1.0)
 
 
-def _window(run: Recording, k: int, m: int) -> tuple[Array, Array, Array]:
+def _window(run: Run, k: int, m: int) -> tuple[Array, Array, Array]:
     """(logged states, controls, steps) of the window from sample k on, filled up to m steps."""
     n = min(m, len(run) - 1 - k)
     states, controls, h = np.full((m + 1, run.x.shape[1]), np.nan), np.zeros((m, run.u.shape[1])), np.zeros(m)
@@ -239,8 +238,8 @@ def lengths(window: int, log: Log) -> list[int]:
     return halved[::-1]
 
 
-def fit_simulation(net: FeatureNet, unit: Array, log: Log, settings: LogSettings, rng: np.random.Generator,
-                   report: Callable[[float], None]) -> list[Stage]:
+def fit_simulation(net: FeatureNet, unit: Array, log: Log, *, window: int, windows: int, steps: int, substeps: int,
+                   ridge: float | None, rng: np.random.Generator, report: Callable[[float], None]) -> list[Stage]:
     """Gauss-Newton steps on windows that grow as long as they succeed; changes the network.
 
     A short window has a minimum that can be reached from afar, even where the plant is unstable or smoothing was poor;
@@ -249,10 +248,10 @@ def fit_simulation(net: FeatureNet, unit: Array, log: Log, settings: LogSettings
     scale, states = torch.from_numpy(unit), [run.smooth.x.copy() for run in log]
     theta = torch.nn.utils.parameters_to_vector(net.parameters()).detach() / scale
     stages: list[Stage] = []
-    for m in (all_lengths := lengths(settings.window, log)):
-        most = settings.windows * settings.window // m  # as many samples
-        problem = _Problem(net, scale, Windows.of(log, states, m, most, rng), settings.substeps, settings.ridge)
-        theta, start, stage = problem.minimise(theta, settings.steps, LAST if m == all_lengths[-1] else ENOUGH, report)
+    for m in (all_lengths := lengths(window, log)):
+        most = windows * window // m  # as many samples
+        problem = _Problem(net, scale, Windows.of(log, states, m, most, rng), substeps, ridge)
+        theta, start, stage = problem.minimise(theta, steps, LAST if m == all_lengths[-1] else ENOUGH, report)
         stages.append(stage)
         if stage.failed:
             break
