@@ -15,6 +15,7 @@ from nocl.comparisons import compare
 from nocl.comparisons.methods import is_plan
 from nocl.solvers import NMPC, registry
 from nocl.solvers.registry import METHODS, Method, Options
+from nocl.systems import quadrotor
 
 
 class Once:
@@ -67,7 +68,7 @@ def test_help_and_errors_read_the_registry(once, capsys):
 
 
 REFUSED = {("rrt-star", "double_integrator"): "kinematic cars", ("rrt-star", "cartpole"): "kinematic cars",
-           ("level-sets", "cartpole"): "at most 3", ("neural-oc", "dubins"): "no minimiser in closed form"}
+           ("level-sets", "cartpole"): "at most 3"}
 
 
 @pytest.mark.parametrize("name", [name for name in METHODS if METHODS[name].make])
@@ -83,6 +84,11 @@ def test_every_method_applies_or_is_refused_in_a_line(name, problem):
     with pytest.raises(ValueError, match=why) as refusal:
         METHODS[name].refuse(ocp, Options(intervals=10))
     assert "\n" not in str(refusal.value)
+
+
+def test_neural_oc_is_refused_where_nothing_curves_in_the_controls():
+    with pytest.raises(ValueError, match="NeuralOC of 'quadrotor'"):
+        METHODS["neural-oc"].refuse(quadrotor.ocp(R=0.0), Options())
 
 
 def test_level_sets_and_rrt_star_have_their_rows(tmp_path, capsys):

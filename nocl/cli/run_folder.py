@@ -225,7 +225,6 @@ def solve(ocp: OCP, out: Path, name: str, n: int, seed: int, intervals: int, wor
     Feedback is simulated. What is solved is kept in OUT/checkpoint until all is: the same call goes on from there.
     """
     options, x0 = registry.Options(intervals, seed), fresh_states(ocp, n, seed)
-    registry.METHODS[name].refuse(ocp, options)
     start, checkpoint = time.perf_counter(), out / "checkpoint" / _solve_key(ocp, name, n, seed, intervals)
     method = registry.METHODS[name].build(ocp, options)
     planned = is_plan(method)
@@ -248,12 +247,10 @@ def _simulated(ocp: OCP, method: Any, x0: Array) -> tuple[Any, dict[str, Any], d
 
 def _solved(method: Any, x0: Array, workers: int | str,
             checkpoint: Path) -> tuple[Any, dict[str, Any], dict[str, Any]]:
-    """(solution, its arrays, how sure each optimum is where the solver tried several starts)."""
+    """(solution, its arrays, how sure each optimum is)."""
     given, takes = {"workers": workers, "out": checkpoint}, signature(method.solve).parameters
     s = method.solve(x0, **{key: value for key, value in given.items() if key in takes})
     arrays = {"t": s.t, "x": s.x, "u": s.u, "cost": s.cost, "success": s.success, "costate": s.costate}
-    if s.starts is None:
-        return s, arrays, {}
     return s, arrays, {"starts": s.starts, "hits": s.hits, "optima": [len(o) for o in s.optima]}
 
 
