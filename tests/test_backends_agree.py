@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from hypothesis import strategies as st
 from test_to_casadi import feature_net
 
 from nocl.exports import parity
-from nocl.exports.bundle import _Export
+from nocl.exports.bundle import export
 from nocl.exports.casadi_forms import to_casadi
 from nocl.nets import ACTIVATIONS
 
@@ -25,9 +26,8 @@ def agree(folder, forms, nx, nu, angles, width, activation, skip, seed) -> set[s
     net = feature_net(nx, nu, min(angles, nx), width, activation, skip)
     function = to_casadi(net, name="policy", in_names=["x", "t"], out_names=["u"])
     part = parity.Part("policy", function, net, {"x": (-3.0, 3.0), "t": (0.0, 5.0)}, net=net)
-    (folder / "new").mkdir()
-    export = _Export([part], folder / "new", folder / "lib", folder, ("fuzz", ""))
-    certificate = export.run(forms, forms, {})
+    network = SimpleNamespace(export_parts=lambda: [part], system=SimpleNamespace(name="fuzz"))
+    certificate = export(network, folder / "out", forms, against=forms)
     assert certificate.ok
     return {f"{f.backend} {f.dtype} {f.of}" for f in certificate.findings}
 

@@ -7,6 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 import torch
+from lq import riccati
 
 import nocl
 from nocl.data import Solution
@@ -53,20 +54,6 @@ def scalar_problem(xdot, running, *, x=None, u=None, lbx=-1.0, ubx=1.0, u_max=1.
 
 
 # Linear-quadratic problems
-
-
-def riccati(A, B, R, P, T, K):
-    """Cost-to-go x'S x and gains of K RK4 steps of xdot = A x + B u, cost int u'R u + x(T)'P x(T), in numpy."""
-    n, m, h = len(A), B.shape[1], T / K
-    M = np.block([[A, B], [np.zeros((m, n + m))]])  # z = (x, u), u held
-    step = np.sum([np.linalg.matrix_power(M * h, i) / np.prod(range(1, i + 1)) for i in range(5)], axis=0)
-    F, G = step[:n, :n], step[:n, n:]
-    S, gains = [P], []
-    for _ in range(K):
-        gains.append(-np.linalg.solve(h * R + G.T @ S[-1] @ G, G.T @ S[-1] @ F))
-        closed = F + G @ gains[-1]
-        S.append(closed.T @ S[-1] @ closed + h * gains[-1].T @ R @ gains[-1])
-    return np.array(S[::-1]), np.array(gains[::-1]), F, G
 
 
 @pytest.mark.parametrize("t0", [0.0, 0.3, 1.9])

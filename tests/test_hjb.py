@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from lq import A, B, lq_value
 from scipy.integrate import solve_ivp
 
 from nocl import hjb
@@ -14,8 +15,7 @@ from nocl.translate.rk4 import rk4_cost
 from nocl.translate.torch_functions import to_torch
 
 T = 2.0
-A, B = np.array([[0.0, 1.0], [0.0, 0.0]]), np.array([[0.0], [1.0]])
-R, P_T = 0.01, np.eye(2)
+R = 0.01
 
 
 def tensor(x):
@@ -34,9 +34,7 @@ def lq():
     def P_dot(P):
         return P @ B @ B.T @ P / R - A.T @ P - P @ A
 
-    sol = solve_ivp(lambda s, p: -P_dot(p.reshape(2, 2)).ravel(), (0, T), P_T.ravel(), method="DOP853",
-                    rtol=1e-13, atol=1e-14, dense_output=True)
-    return *map(to_torch, (ocp.system.f, ocp.L, ocp.G)), (lambda t: sol.sol(T - t).reshape(2, 2)), P_dot
+    return *map(to_torch, (ocp.system.f, ocp.L, ocp.G)), (lambda t: lq_value([t], T=T, R=R)[0][0]), P_dot
 
 
 class RiccatiValue(torch.autograd.Function):

@@ -144,3 +144,11 @@ def test_the_light_part_leaves_torch_alone(statement):
     code = f"{statement}; import sys; print([m for m in ('torch', 'matplotlib', 'scipy') if m in sys.modules])"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert run.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_editors_find_the_folders_at_the_top(name):
+    """pyrightconfig.json looks in editor/, where nocl has them by their names."""
+    link = ROOT / "editor/nocl" / name
+    assert link.is_symlink()
+    assert link.resolve() == ROOT / name

@@ -5,6 +5,7 @@ import pickle
 import casadi as ca
 import numpy as np
 import pytest
+from lq import rk4_lq
 
 import nocl
 from nocl.data import Trajectory
@@ -21,18 +22,6 @@ def walled(wall=-0.5, u_max=10.0):
                          lbx=[-3.0, -3.0], ubx=[3.0, 3.0])
     return nocl.OCP(system, horizon=2.0, running=0.01 * u**2, terminal=p**2 + v**2, x_goal=[0.0, 0.0], u_goal=[0.0],
                     initial_states=nocl.Gaussian([1.0, 0.0], [0.2, 0.2]), path_constraints={"wall": p - wall})
-
-
-def rk4_lq(h, N):
-    """The double integrator under 0.01 u^2, |x|^2 by RK4, which is exact for it: (A, B, gains, Hessians of V)."""
-    A, B, R, P = np.array([[1.0, h], [0.0, 1.0]]), np.array([[h**2 / 2], [h]]), 0.02 * h * np.eye(1), 2 * np.eye(2)
-    gains, values = [], [P]
-    for _ in range(N):
-        K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
-        P = A.T @ P @ (A - B @ K)
-        gains.insert(0, K)
-        values.insert(0, P)
-    return A, B, gains, values
 
 
 @pytest.mark.parametrize("solver", ["fatrop", "ipopt"])

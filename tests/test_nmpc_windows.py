@@ -3,7 +3,8 @@
 import casadi as ca
 import numpy as np
 import pytest
-from test_nmpc import rk4_lq, walled
+from lq import rk4_lq
+from test_nmpc import walled
 
 import nocl
 from nocl.judge import simulate

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from lq import rk4_lq
 
 import nocl
 from nocl.judge import simulate
@@ -20,33 +21,23 @@ SETTINGS = TrainSettings(intervals=40, seeds=4, starts=2, states=60, tails=400, 
 HELD = 0.05  # s, the horizon of 2 s over 40
 
 
-def sampled_gains(T=2.0, dt=HELD, R=0.01):
-    """K [N, 1, 2] of u_k = -K_k x_k held for dt, by the discrete Riccati recursion from V(T) = |x|^2."""
-    A, B = np.array([[1.0, dt], [0.0, 1.0]]), np.array([[dt**2 / 2], [dt]])
-    S, gains = np.eye(2), []
-    for _ in range(round(T / dt)):
-        K = np.linalg.solve(R * dt + B.T @ S @ B, B.T @ S @ A)
-        S = A.T @ S @ (A - B @ K)
-        gains.append(K)
-    return np.array(gains[::-1])
-
-
 @pytest.fixture(scope="module")
 def cnd():
     return nocl.train(nocl.load_ocp("double_integrator"), settings=SETTINGS, seed=0, progress=False)
 
 
 def test_held_controls_are_the_sampled_riccati_feedback(cnd):
-    K, x0 = sampled_gains(), cnd.ocp.initial_states.sample(20, 99)
-    A, B = np.array([[1.0, HELD], [0.0, 1.0]]), np.array([HELD**2 / 2, HELD])
+    F, G, K, _ = rk4_lq(HELD, 40)
+    x0 = cnd.ocp.initial_states.sample(20, 99)
     x, wanted, told, continuous = x0, [], [], []  # continuous: the law of held controls too short to tell
     held = cnd.at_rate(HELD)
     for k, gain in enumerate(K):
         u = -x @ gain.T
         wanted.append(u)
         told.append(held(x, k * HELD))
-        continuous.append(-x @ sampled_gains(2.0 - k * HELD, HELD / 50)[0].T)
-        x = x @ A.T + u * B
+        continuous.append(-x @ rk4_lq(HELD / 50, 50 * (40 - k))[2][0].T)
+        x = x @ F.T + u @ G.T
+
     def error(laws):
         return np.sqrt(np.mean((np.array(laws) - wanted) ** 2)) / np.std(wanted)
 
@@ -102,7 +93,8 @@ def test_labels_of_other_rates_are_optimal_held_controls():
     assert np.isfinite(labels.weight).all()
     for i in range(0, len(labels), len(labels) // 20):
         left = ocp.horizon - labels.t[i]
-        gain = sampled_gains(left, left / round(left / labels.dt[i]))[0]
+        n = round(left / labels.dt[i])
+        gain = rk4_lq(left / n, n)[2][0]
         assert labels.u[i] == pytest.approx(-gain @ labels.x[i], rel=1e-6, abs=1e-7)
 
 

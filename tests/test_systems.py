@@ -6,6 +6,7 @@ from importlib import import_module
 
 import numpy as np
 import pytest
+from lq import lq_value
 from numpy import cos, pi, sin
 
 import nocl
@@ -264,10 +265,7 @@ def test_double_integrators_closed_form_solves_riccatis_equation():
     R, T = 0.3, ocp.horizon
 
     def S(t):
-        s = T - t
-        W = np.array([[s**3 / 3, s**2 / 2], [s**2 / 2, s]]) / (1.5**2 * R)
-        Phi = np.array([[1, s], [0, 1]])
-        return Phi.T @ np.linalg.inv(np.diag([1 / 2.0, 1 / 0.5]) + W) @ Phi
+        return lq_value([t], T=T, R=R, P=(2.0, 0.5), mass=1.5)[0][0]
 
     np.testing.assert_allclose(S(T), np.diag([2.0, 0.5]), atol=1e-14)
     for t in (0.1, 0.9, 1.7):

@@ -8,12 +8,13 @@ import casadi as ca
 import numpy as np
 import pytest
 import torch
+from lq import lq_symbols, lq_value
 
 import nocl
 from nocl.hjb import hjb_residual
 from nocl.judge import simulate
 from nocl.nets import MLP, FeatureNet
-from nocl.solvers import NMPC
+from nocl.solvers import LQR, NMPC
 from nocl.solvers.cnd import TrainSettings
 from nocl.solvers.cnd.features import policy_net
 from nocl.solvers.cnd.labels import (
@@ -42,15 +43,6 @@ TINY = replace(QUICK, intervals=20, batch=64, states=10, tails=40, visits=20, ro
                value_initial=10, value_tails=40, value_visits=10, value_iterations=20, value_rounds=1, held_out=4)
 
 
-def riccati(t, T=2.0, R=0.01):
-    """S [n, 2, 2] of V = x' S x, and the gains K [n, 1, 2] of u = -K x: systems/double_integrator.py has the source."""
-    s = T - np.asarray(t, dtype=float)
-    W = np.array([[s**3 / 3, s**2 / 2], [s**2 / 2, s]]).transpose(2, 0, 1) / R
-    Phi = np.array([[np.ones_like(s), s], [np.zeros_like(s), np.ones_like(s)]]).transpose(2, 0, 1)
-    S = Phi.transpose(0, 2, 1) @ np.linalg.inv(np.eye(2) + W) @ Phi
-    return S, S[:, 1:] / R
-
-
 @pytest.fixture(scope="module")
 def integrator():
     ocp = nocl.load_ocp("double_integrator")
@@ -69,20 +61,15 @@ def pendulum():
 
 
 def paths(ocp, x0, nodes=21):
-    """Optimal paths of the double integrator (t [n], x [n, 2]) from x0, by the analytic feedback."""
-    x, t = ca.SX.sym("x", 2), ca.SX.sym("t")
-    s = ocp.horizon - t
-    W = ca.vertcat(ca.horzcat(s**3 / 3, s**2 / 2), ca.horzcat(s**2 / 2, s)) / 0.01
-    Phi = ca.vertcat(ca.horzcat(1, s), ca.horzcat(0, 1))
-    S = Phi.T @ ca.inv(ca.SX.eye(2) + W) @ Phi
-    run = simulate(ocp, ca.Function("lq", [x, t], [-(S[1, :] @ x) / 0.01]), x0, nodes=nodes)
+    """Optimal paths of the double integrator (t [n], x [n, 2]) from x0: LQR is tested by itself."""
+    run = simulate(ocp, LQR(ocp), x0, nodes=nodes)
     return np.tile(run.t, len(x0)), run.x.reshape(-1, 2), run
 
 
 def test_linear_quadratic_policy_is_the_riccati_feedback(integrator):
     ocp, cnd = integrator
     t, x, _ = paths(ocp, ocp.initial_states.sample(20, 99))
-    _, K = riccati(t)
+    _, K = lq_value(t)
     u = -np.einsum("nij,nj->ni", K, x)
     early = t < 0.98 * ocp.horizon  # labels end half an interval before T
     assert np.sqrt(np.mean((cnd(x, t) - u)[early] ** 2)) < 0.06 * u.std()
@@ -91,7 +78,7 @@ def test_linear_quadratic_policy_is_the_riccati_feedback(integrator):
 def test_linear_quadratic_value_is_the_riccati_value(integrator):
     ocp, cnd = integrator
     t, x, _ = paths(ocp, ocp.initial_states.sample(20, 99))
-    S, _ = riccati(t)
+    S, _ = lq_value(t)
     V, V_x = np.einsum("ni,nij,nj->n", x, S, x), 2 * np.einsum("nij,nj->ni", S, x)
     error = np.abs(cnd.value(x, t) - V) / V
     assert np.median(error) < 0.005
@@ -104,7 +91,7 @@ def test_linear_quadratic_value_is_the_riccati_value(integrator):
 def test_linear_quadratic_cost_in_continuous_time(integrator):
     ocp, cnd = integrator
     x0 = ocp.initial_states.sample(20, 99)
-    S, _ = riccati([0.0])
+    S, _ = lq_value([0.0])
     best = np.einsum("ni,ij,nj->n", x0, S[0], x0)
     gap = simulate(ocp, cnd, x0).cost / best - 1
     assert (gap > -1e-6).all()
@@ -238,16 +225,12 @@ def test_value_scores_are_zero_for_the_exact_value():
     ocp = nocl.load_ocp("double_integrator")
     fine, x0 = DDP(ocp, intervals=320), ocp.initial_states.sample(10, 5)
     starts = fine.solve(x0)
-    x, t = ca.SX.sym("x", 2), ca.SX.sym("t")
-    s = ocp.horizon - t
-    W = ca.vertcat(ca.horzcat(s**3 / 3, s**2 / 2), ca.horzcat(s**2 / 2, s)) / 0.01
-    Phi = ca.vertcat(ca.horzcat(1, s), ca.horzcat(0, 1))
-    S = Phi.T @ ca.inv(ca.SX.eye(2) + W) @ Phi
+    x, (t, S, K) = ca.SX.sym("x", 2), lq_symbols()
 
     def value(X, T):
         return nocl.to_torch(ca.Function("V", [x, t], [x.T @ S @ x]))(X, T)
 
-    policy = nocl.to_torch(ca.Function("u", [x, t], [-(S[1, :] @ x) / 0.01]))
+    policy = nocl.to_torch(ca.Function("u", [x, t], [-K @ x]))
     f, optima = nocl.to_torch(ocp.system.f), {"initial": starts, "tails": starts}
     row = value_scores(ocp, value, policy, f, optima)
     assert row["tails_error"] < 1e-4
@@ -478,7 +461,7 @@ def test_value_labels_are_costs_to_go_on_the_fine_grid(pendulum):
 def riccati_labels(n=4000, shift=0.0):
     rng = np.random.default_rng(0)
     t, x = rng.uniform(0, 2, n), rng.standard_normal((n, 2))
-    S, _ = riccati(t)
+    S, _ = lq_value(t)
     return ValueLabels(x, t, np.einsum("ni,nij,nj->n", x, S, x) + shift, 2 * np.einsum("nij,nj->ni", S, x))
 
 
