@@ -90,9 +90,17 @@ def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: i
 
 
 def check_made_for(ocp: OCP, thing: Any, what: str) -> None:
-    """ValueError where `thing` (a controller, a value function) was made for a problem on another system."""
+    """ValueError where `thing` (a controller, a value function) was made for a problem on another system.
+
+    Other names of states and controls are refused of everything that has an `ocp`. Other equations are refused of what
+    was trained and may have been loaded (it has a card); a law that is built on a model on the spot, like LQR, may be
+    tried on the plant.
+    """
     made_for = getattr(thing, "ocp", None)
-    if isinstance(made_for, OCP) and (differ := ocp.system.difference(made_for.system)):
+    if not isinstance(made_for, OCP):
+        return
+    differ = ocp.system.difference(made_for.system, equations=hasattr(thing, "card"))
+    if differ:
         raise ValueError(f"{what} was made for {made_for.system.name!r}, which is another system than this problem's "
                          f"{ocp.system.name!r}: {differ}; expected one made for it (to try a controller on another "
                          "plant, keep its problem and pass the plant's equations, simulate(..., f=))")

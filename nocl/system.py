@@ -169,13 +169,13 @@ class System:
         A, B = self.jacobian(checks.vector(x, self.nx, "x", owner), checks.vector(u, self.nu, "u", owner))
         return A.full(), B.full()
 
-    def difference(self, other: System) -> str:
-        """What tells another system from this one, names or equations; "" where they are the same."""
+    def difference(self, other: System, equations: bool = True) -> str:
+        """What tells another system from this one, names or (where asked) equations; "" where they are the same."""
         for what, own, theirs in (("states", self.state_names, other.state_names),
                                   ("controls", self.control_names, other.control_names)):
             if own != theirs:
                 return f"its {what} are {', '.join(theirs)}, not {', '.join(own)}"
-        if self.xdot is None or other.xdot is None or self.xdot is other.xdot:
+        if not equations or self.xdot is None or other.xdot is None or self.xdot is other.xdot:
             return ""
         rng = np.random.default_rng(0)
         x = rng.uniform(self.lbx, self.ubx, (N_SAME, self.nx)).T
