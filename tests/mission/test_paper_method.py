@@ -11,7 +11,7 @@ TERMS = ["cost", "hjb", "final", "hamil"]
 
 TRAIN = """
 import json, numpy as np, nocl
-from nocl.solvers.cnd.published_settings import PaperSettings
+from nocl.solvers.cnd.settings import PaperSettings
 ocp = nocl.load_ocp("pendulum")
 cnd = nocl.train(ocp, method="paper", seed=0, settings=PaperSettings(iterations=400), progress=False)
 x0 = ocp.initial_states.sample(20, seed=1)
