@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import casadi as ca
+import cloudpickle
 import numpy as np
 from numpy.typing import NDArray
 
@@ -102,8 +103,6 @@ class Judging:
 
     def __reduce__(self) -> tuple[Any, ...]:
         """By cloudpickle, so that users' functions reach processes too."""
-        import cloudpickle
-
         slim = [replace(run, method=None, solved=None if run.solved is None else
                         replace(run.solved, plan=None)) for run in self.runs]  # type: ignore[arg-type]
         return _unpickled, (cloudpickle.dumps((self.ocp, self.x0, slim, self.disturbance, self.delays, self.timed)),)
@@ -148,8 +147,6 @@ class Judging:
 
 
 def _unpickled(data: bytes) -> Judging:
-    import cloudpickle
-
     return Judging(*cloudpickle.loads(data))
 
 

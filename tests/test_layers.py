@@ -5,6 +5,7 @@ an `__init__.py` does not, nor what starts the program, `__main__.py`.
 """
 
 import ast
+import re
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -16,8 +17,9 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = {"systems": "nocl.systems", "solvers": "nocl.solvers", "comparisons": "nocl.comparisons"}
 MOST = 17  # files of a folder, __init__.py aside
 START = "nocl.__main__"
-HEAVY = {"torch", "matplotlib", "plotly", "jax", "onnx", "onnxruntime", "l4casadi", "gymnasium", "control", "ompl",
-         "pyarrow", "distributed", "scipy", "tqdm"}
+HEAVY = {"torch", "matplotlib", "plotly", "jax", "hj_reachability", "onnx", "onnxruntime", "l4casadi", "gymnasium",
+         "control", "do_mpc", "acados_template", "ompl", "pyarrow", "distributed", "joblib", "scipy", "pil",
+         "pytorch_optimizer"}  # in small letters
 
 
 def files() -> dict[str, Path]:
@@ -137,6 +139,48 @@ def test_packages_are_imported_by_their_nocl_name(name):
     names += [n.module or "" for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and not n.level]
     bare = [t for t in names if t.partition(".")[0] in PACKAGES]
     assert not bare, f"{name} imports {bare}: write nocl.{bare[0]}"
+
+
+def loads(name: str, seen: set[str] | None = None) -> set[str]:
+    """The heavy libraries that importing a module brings, by the imports at the top of it and of what it imports."""
+    seen = set() if seen is None else seen
+    if name in seen:
+        return set()
+    seen.add(name)
+    found = set()
+    body = ast.parse(FILES[name].read_text()).body
+    for node in [n for top in body for n in (top.body if isinstance(top, ast.Try) else [top])]:
+        for written in names_of(node):
+            library = written.partition(".")[0].lower()
+            found |= loads(module_of(written), seen) if library == "nocl" else {library} & HEAVY
+    return found
+
+
+def names_of(node: ast.AST) -> list[str]:
+    """What an import statement imports, in full; [] for other statements."""
+    if isinstance(node, ast.Import):
+        return [a.name for a in node.names]
+    return [f"{node.module}.{a.name}" for a in node.names] if isinstance(node, ast.ImportFrom) else []
+
+
+def inside_functions(name: str) -> Iterator[tuple[str, str]]:
+    """(what is imported, the comment behind it) of each import inside a function."""
+    source = FILES[name].read_text()
+    lines = source.splitlines()
+    functions = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.FunctionDef)]
+    for node in {n.lineno: n for f in functions for n in ast.walk(f) if names_of(n)}.values():
+        for written in names_of(node):
+            yield written, lines[node.lineno - 1].partition("#")[2].lower()
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_an_import_inside_a_function_keeps_a_heavy_library_out_and_says_which(name):
+    """The library's own import says it by itself; behind one of nocl's stands a comment."""
+    for written, comment in inside_functions(name):
+        library = written.partition(".")[0].lower()
+        kept = {library} & HEAVY if library != "nocl" else {
+            heavy for heavy in loads(module_of(written)) if re.search(rf"\b{heavy}\b", comment)}
+        assert kept - loads(name), f"{name} imports {written} inside a function: do so at the top, or say what it saves"
 
 
 @pytest.mark.parametrize("statement", ["import nocl", "import nocl; nocl.load_ocp('cartpole')"])

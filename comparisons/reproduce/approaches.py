@@ -205,7 +205,7 @@ class Approaches(table.Table[Plan, Cell, Cell]):
         import matplotlib
         from matplotlib.figure import Figure
 
-        from nocl.comparisons.report.style import COLOURS, STYLE
+        from nocl.comparisons.report.style import COLOURS, STYLE  # matplotlib
 
         quantities = {"memory": "memory, MB", "before": "s before", "ms": "ms a state", "error": "mean error of V"}
         with matplotlib.rc_context(STYLE):

@@ -217,7 +217,7 @@ class Control(table.Table[Plan, Cell, Entry]):
         import matplotlib
         from matplotlib.figure import Figure
 
-        from nocl.comparisons.report.style import COLOURS, STYLE
+        from nocl.comparisons.report.style import COLOURS, STYLE  # matplotlib
 
         shown = [c for c in cells if c.paths and c.seed == min(c.seed for c in cells if c.paths)]
         rows, ways = math.ceil(len(shown) / COLUMNS), self.ways

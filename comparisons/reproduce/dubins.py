@@ -313,7 +313,7 @@ class Dubins(table.Table[Plan, Cell, Entry]):
         from matplotlib.figure import Figure
         from matplotlib.patches import Circle
 
-        from nocl.comparisons.report.style import COLOURS, STYLE
+        from nocl.comparisons.report.style import COLOURS, STYLE  # matplotlib
 
         shown = [c for c in cells if c.seed == min(c.seed for c in cells)]
         rows = math.ceil(len(shown) / COLUMNS)

@@ -7,12 +7,15 @@ import os
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from nocl import __version__
 from nocl.cli import arguments, reproduce
 from nocl.solvers import registry
 from nocl.support.fields import EFFORTS
+from nocl.systems import NAMES, load_ocp
 
 if TYPE_CHECKING:
     from nocl.ocp import OCP
@@ -138,14 +141,10 @@ def _told_of(names: Iterable[str]) -> str:
 
 
 def _version() -> str:
-    from nocl import __version__
-
     return f"nocl {__version__}"
 
 
 def _list(args: argparse.Namespace) -> None:
-    from nocl.systems import NAMES, load_ocp
-
     width = max(map(len, NAMES))
     print(f"{'name'.ljust(width)}  states  controls  horizon  problem")
     for name in NAMES:
@@ -156,16 +155,12 @@ def _list(args: argparse.Namespace) -> None:
 
 def _about(name: str) -> str:
     """The first line of a bundled problem's file, without its title."""
-    from importlib import import_module
-
     first = (import_module(f"nocl.systems.{name}").__doc__ or "").strip().splitlines()[0]
     return first.partition(": ")[2] or first
 
 
 def _problem(args: argparse.Namespace) -> tuple[OCP, Path]:
     """The problem and the folder for its output; ValueError before anything is written."""
-    from nocl.systems import load_ocp
-
     ocp = load_ocp(args.problem)
     name = Path(args.problem).stem if args.problem.endswith(".py") else args.problem
     out = args.out if args.out is not None else Path("runs") / name
@@ -174,7 +169,7 @@ def _problem(args: argparse.Namespace) -> tuple[OCP, Path]:
 
 
 def _run(args: argparse.Namespace) -> None:
-    from nocl.cli.run_folder import Stages
+    from nocl.cli.run_folder import Stages  # torch
 
     ocp, out = _problem(args)
     stages = Stages(ocp, out, args.seed, args.effort)
@@ -198,7 +193,7 @@ def _told(stage: Callable[[], None]) -> ValueError | None:
 
 
 def _identify(args: argparse.Namespace) -> None:
-    from nocl.cli.run_folder import Stages
+    from nocl.cli.run_folder import Stages  # torch
 
     ocp, out = _problem(args)
     stages = Stages(ocp, out, args.seed, args.effort)
@@ -212,7 +207,7 @@ def _identify(args: argparse.Namespace) -> None:
 
 
 def _train(args: argparse.Namespace) -> None:
-    from nocl.cli.run_folder import Stages
+    from nocl.cli.run_folder import Stages  # torch
 
     ocp, out = _problem(args)
     stages = Stages(ocp, out, args.seed, args.effort)
@@ -221,14 +216,14 @@ def _train(args: argparse.Namespace) -> None:
 
 
 def _solve(args: argparse.Namespace) -> None:
-    from nocl.cli.run_folder import solve
+    from nocl.cli.run_folder import solve  # torch
 
     ocp, out = _problem(args)
     solve(ocp, out / "solutions", args.solver, args.n, args.seed, args.intervals, args.workers)
 
 
 def _export(args: argparse.Namespace) -> None:
-    from nocl.cli.run_folder import Stages, load_run
+    from nocl.cli.run_folder import Stages, load_run  # torch
 
     run = args.run
     cnd = load_run(run)
@@ -238,7 +233,7 @@ def _export(args: argparse.Namespace) -> None:
 
 
 def _compare(args: argparse.Namespace) -> None:
-    from nocl.cli.run_folder import Stages, load_run
+    from nocl.cli.run_folder import Stages, load_run  # torch
 
     run = args.run
     cnd = load_run(run)

@@ -20,7 +20,10 @@ from typing import Any
 import numpy as np
 
 from nocl import __version__
+from nocl.comparisons.disturbances import mass_variants
 from nocl.comparisons.methods import is_plan, own_rate
+from nocl.comparisons.studies import study
+from nocl.exports.bundle import export
 from nocl.judge import simulate
 from nocl.ocp import OCP
 from nocl.solvers import registry
@@ -121,8 +124,6 @@ class Stages:
 
     def export(self, cnd: CND, out: Path, forms: Sequence[str], against: Sequence[str] | None) -> None:
         """Controller, value function and, where there are any, learned dynamics, with the proof of parity."""
-        from nocl.exports.bundle import export
-
         start = time.perf_counter()
         model = self._dynamics_there() if cnd.card.get("dynamics") == "learned" else None
         say(f"export: {', '.join(forms)} to {out}")
@@ -132,9 +133,6 @@ class Stages:
     def compare(self, cnd: CND, out: Path, methods: Sequence[str], n: int, intervals: int,
                 hold: Sequence[int | None] | None = None, robust: bool = False) -> None:
         """Study the methods on n fresh initial states, save the report and print its summary and verdict."""
-        from nocl.comparisons.disturbances import mass_variants
-        from nocl.comparisons.studies import study
-
         entries, options = [registry.METHODS[name] for name in methods], registry.Options(intervals, self.seed)
         titles = ", ".join(entry.title for entry in entries)
         say(f"comparing {titles} on {n} initial states, drawn with seed {fresh_seed(self.seed)}, on the exact dynamics")

@@ -14,7 +14,10 @@ import casadi as ca
 import numpy as np
 
 from nocl.exports import parity
+from nocl.exports.c_code import load
 from nocl.exports.casadi_forms import to_casadi
+from nocl.exports.onnx_reader import from_onnx
+from nocl.exports.onnx_writer import Session, to_onnx
 from nocl.exports.parity import Certificate, Finding, Part
 from nocl.support import compiler, store
 from nocl.support.checks import Array
@@ -173,9 +176,6 @@ class _Export:
                 built.save(str(folder / f"{part.name}.casadi"))
 
     def _onnx(self, keep: bool) -> None:
-        from nocl.exports.onnx_reader import from_onnx
-        from nocl.exports.onnx_writer import Session, to_onnx
-
         folder = (self.new if keep else self.scratch) / "onnx"
         for part in self.parts:
             if part.net is not None:
@@ -193,8 +193,6 @@ class _Export:
 
     def _by_c(self, part: Part, folder: Path, dtype: str) -> None:
         """A function's C against its values; networks also get the C of their Jacobian, in passing."""
-        from nocl.exports.c_code import load
-
         prefix, note = self.title
         compiled = load(part.to_c(folder, prefix, dtype=dtype, note=note), f"{prefix}_{part.name}")
         slopes = None

@@ -16,6 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from nocl.exports import l4casadi_forms
 from nocl.nets import MLP, FeatureNet, Sine
 
 BACKENDS = ("native", "l4casadi")
@@ -62,8 +63,6 @@ def to_casadi(module: nn.Module, n_in: int | Sequence[int] | None = None, *, bac
         args = [ca.MX.sym(i, n) for i, n in zip(ins, sizes, strict=True)]
         results = _feature_net(module, args) if type(module) is FeatureNet else _plain(module, args)
         return _function(name, args, results, ins, outs)
-    from nocl.exports import l4casadi_forms
-
     return l4casadi_forms.build(module, sizes, name, build_dir, ins, outs)
 
 

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nocl.exports.c_code import to_c
 from nocl.nets import FeatureNet
 from nocl.support.checks import Array
 
@@ -53,8 +54,6 @@ class Part:
 
     def to_c(self, folder: Path, prefix: str, *, dtype: str, note: str = "") -> Path:
         """C99 in `folder`, as PREFIX_NAME."""
-        from nocl.exports.c_code import to_c
-
         return to_c(self.lean or self.column, folder, f"{prefix}_{self.name}", bounds=self.bounds, labels=self.labels,
                     dtype=dtype, note=note)
 

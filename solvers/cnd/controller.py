@@ -15,6 +15,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from nocl import records
+from nocl.exports.bundle import export
 from nocl.exports.casadi_forms import to_casadi
 from nocl.exports.parity import Certificate, Part
 from nocl.judge import dynamics_function
@@ -155,8 +156,6 @@ class CND:
 
     def export(self, folder: str | os.PathLike[str], to: Sequence[str] = ("casadi",), **options: Any) -> Certificate:
         """Files of all `parts()` in `folder`, proven equal to this controller: see nocl.exports.bundle.export."""
-        from nocl.exports.bundle import export
-
         return export(self, folder, to, **options)
 
     def rounded(self) -> CND:
@@ -168,7 +167,7 @@ class CND:
 
     def plot_training(self, path: str | os.PathLike[str]) -> Path:
         """A picture of how it was trained, as a png at `path`: losses, and the gap on held-out states by round."""
-        from nocl.solvers.cnd.plot import plot_training
+        from nocl.solvers.cnd.plot import plot_training  # matplotlib
 
         return plot_training(self.card, Path(path), self.ocp.system.name)
 

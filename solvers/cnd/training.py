@@ -33,6 +33,7 @@ from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.features import at_rate, policy_net
 from nocl.solvers.cnd.identity import identity
 from nocl.solvers.cnd.labels import Labels, at_other_rates, tube, visited
+from nocl.solvers.cnd.paper import PaperSettings, train_paper
 from nocl.solvers.cnd.regress import fit_net, policy_loss
 from nocl.solvers.cnd.settings import TrainSettings
 from nocl.solvers.cnd.validate import (
@@ -89,8 +90,6 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
     """
     _check(ocp, dynamics, seed, out)
     if method == "paper":
-        from nocl.solvers.cnd.paper import PaperSettings, train_paper
-
         chosen = _expect(settings, PaperSettings)
         checkpoint = None if out is None else Path(out) / CHECKPOINT
         policy, value, card = train_paper(ocp, dynamics, chosen, seed=seed, progress=progress, checkpoint=checkpoint)

@@ -69,7 +69,7 @@ class SolutionBank:
 
     def save(self, folder: str | os.PathLike[str]) -> Path:
         """Write folder/bank.safetensors, data only, atomically."""
-        from nocl.support import store
+        from nocl.support import store  # torch
 
         arrays = {name: value for name, value in self.solution.arrays().items() if name != "message"}
         return store.save_checkpoint(Path(folder) / FILE, {"solution": arrays, "scale": self.scale}, {"kind": KIND})
@@ -77,7 +77,7 @@ class SolutionBank:
     @staticmethod
     def load(folder: str | os.PathLike[str]) -> SolutionBank:
         """The bank that `save` wrote, bit by bit; ValueError for a missing, truncated, altered or foreign file."""
-        from nocl.support import store
+        from nocl.support import store  # torch
 
         path = Path(folder) / FILE
         if not path.is_file():

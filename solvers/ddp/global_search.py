@@ -280,7 +280,7 @@ class _Search:
         """Write what is known after a stage, then drop the stage's pieces."""
         if self.folder is None:
             return
-        from nocl.support import store
+        from nocl.support import store  # torch
 
         best = {name: value for name, value in self.best.arrays().items() if name != "message"}
         state = {"best": best, "message": self.best.message.tolist(), "near": self.near,
@@ -299,7 +299,7 @@ class _Search:
             if all(part.name.startswith("stage-001") for part in self.folder.iterdir()):
                 return
             raise ValueError(f"{self.folder} is not empty and holds no search; expected a new folder: change `out`")
-        from nocl.support import store
+        from nocl.support import store  # torch
 
         state, meta = store.load_checkpoint(self.folder / CHECKPOINT)
         if meta.get("key") != self.key:
