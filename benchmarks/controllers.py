@@ -40,8 +40,9 @@ from nocl.solvers.cnd import TrainSettings
 from nocl.solvers.cnd.labels import policy_controls
 from nocl.solvers.cnd.validate import feasible, kicked_optima, tube_optima, value_scores
 from nocl.solvers.ddp.bank import SolutionBank, better
-from nocl.solvers.ddp.global_search import cold_controls, solve_globally
+from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP
+from nocl.solvers.starts import random_controls
 from nocl.support.checks import Array
 
 FINE = 640  # intervals of the reference
@@ -93,7 +94,7 @@ def cost_of_kicks(ocp: OCP, policy: FeatureNet, run: Simulation, kicks: list[tup
 def explained(ocp: OCP, x0: Array, gap: float, cost: float) -> dict[str, Any]:
     """One of the worst initial states: what the controller costs there beside the optima of COLD cold starts."""
     ddp = DDP(ocp)
-    s = ddp.solve(np.repeat(x0[None], COLD, axis=0), u=cold_controls(ddp, COLD, seed=5))
+    s = ddp.solve(np.repeat(x0[None], COLD, axis=0), u=random_controls(ocp, ddp.intervals, COLD, 5))
     found = np.sort(s.cost[s.success])
     apart = np.append(True, np.diff(found) > 1e-3 * found[:-1]) if len(found) else []
     return {"x0": [round(v, 4) for v in x0.tolist()], "gap_%": round(100 * gap, 3), "controller": round(cost, 5),

@@ -10,8 +10,9 @@ import pytest
 import nocl
 from nocl.data import Solution
 from nocl.solvers.ddp.bank import SolutionBank, better, extend
-from nocl.solvers.ddp.global_search import GlobalDDP, clean, cold_controls, equilibria, solve_globally
+from nocl.solvers.ddp.global_search import GlobalDDP, clean, equilibria, solve_globally
 from nocl.solvers.ddp.solver import DDP
+from nocl.solvers.starts import random_controls
 
 N = 24
 
@@ -41,7 +42,7 @@ def found() -> Solution:
 def best_known() -> np.ndarray:
     """The least cost of 10 other cold starts a state, and of all that `found` tried."""
     ddp, best = cartpole(), found().cost
-    controls = cold_controls(ddp, N * 10, 99).reshape(10, N, ddp.intervals, -1)
+    controls = random_controls(ddp.ocp, ddp.intervals, N * 10, 99).reshape(10, N, ddp.intervals, -1)
     for u in controls:
         best = np.minimum(best, ddp.solve(states(), u=u).cost)
     return best
@@ -80,7 +81,7 @@ def test_a_pole_that_can_be_caught_is():
     """Random controls, in open loop, rarely stumble on the catch that the held goal starts from."""
     x0 = [[1.04, -0.03, -1.39, 3.44]]
     assert solve_globally(cartpole(), x0, starts=2, rounds=0).cost[0] < 0.01
-    blind = cartpole().solve(np.repeat(x0, 20, axis=0), u=cold_controls(cartpole(), 20, 0))
+    blind = cartpole().solve(np.repeat(x0, 20, axis=0), u=random_controls(cartpole().ocp, 40, 20, 0))
     assert (blind.cost < 0.01).mean() < 0.2
 
 
@@ -141,12 +142,13 @@ def test_an_interrupted_search_goes_on_where_it_was(tmp_path, monkeypatch):
         m.setattr(DDP, "descend", interrupted)
         with pytest.raises(KeyboardInterrupt):
             solve_globally(cartpole(), x0, **options, out=tmp_path / "s")
+    before = sum(solved)
     solved.clear()
     monkeypatch.setattr(DDP, "descend", lambda self, batch: solved.append(batch.size) or descend(self, batch))
     again = solve_globally(cartpole(), x0, **options, out=tmp_path / "s")
     assert np.array_equal(again.u, whole.u)
     assert np.array_equal(again.starts, whole.starts)
-    assert sum(solved) + 6 * 8 >= whole.starts.sum() > sum(solved)
+    assert before + sum(solved) == whole.starts.sum()
     solved.clear()
     third = solve_globally(cartpole(), x0, **options, out=tmp_path / "s")
     assert not solved
@@ -160,19 +162,6 @@ def test_an_interrupted_search_goes_on_where_it_was(tmp_path, monkeypatch):
     (tmp_path / "full" / "thesis.tex").write_text("mine")
     with pytest.raises(ValueError, match="not empty"):
         solve_globally(cartpole(), x0, **options, out=tmp_path / "full")
-
-
-def test_cold_controls_are_smooth_in_the_box_and_around_both_centres():
-    ddp = DDP(nocl.load_ocp("quadrotor"), intervals=20, threads=1)
-    u = cold_controls(ddp, 200, 0)
-    s = ddp.ocp.system
-    assert u.shape == (200, 20, 4)
-    assert ((u >= s.lbu) & (u <= s.ubu)).all()
-    assert np.array_equal(u, cold_controls(ddp, 200, 0))
-    assert np.abs(np.diff(u, axis=1)).mean() < 0.3 * u.std()
-    thrust = u[:, :, 0].mean(axis=1)
-    assert (np.abs(thrust - 9.81) < np.abs(thrust)).mean() > 0.4
-    assert (np.abs(thrust) < np.abs(thrust - 9.81)).mean() > 0.3
 
 
 def test_extend_is_the_best_descent_from_its_neighbours():
@@ -223,16 +212,6 @@ def test_a_guess_lies_on_its_parents_trajectory_and_solves_at_once():
     whole = cartpole().solve(s.x[:, 0], **b.guess(np.arange(len(b))))
     assert (whole.iterations <= 2).all()
     assert np.abs(whole.cost / s.cost - 1).max() < 1e-9
-
-
-def test_what_passes_by_is_stretched_or_held():
-    b, s = bank(), bank().solution
-    rows, start = np.array([2, 2]), np.array([1.0, 1.0])
-    guess = b.late(rows, start, np.array([True, False]))
-    assert np.allclose(guess["x"][:, 0], s.x[2, 10])
-    assert np.allclose(guess["x"][0, :31], s.x[2, 10:])
-    assert np.allclose(guess["x"][0, 30:], s.x[2, 40])
-    assert np.allclose(guess["x"][1, [20, 40]], [(s.x[2, 25]), s.x[2, 40]])
 
 
 def test_interpolation_is_the_local_model_of_the_nearest_solution():

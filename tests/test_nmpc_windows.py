@@ -206,16 +206,17 @@ def test_distinct_optima_are_listed():
 
 def test_mirror_images_and_sides():
     """Dubins is its own mirror image at py = 0: found, used, and a start passes the obstacle on either side."""
+    from nocl.solvers.mirrors import mirrors
     from nocl.solvers.nmpc import guesses
 
     ocp = nocl.load_ocp("dubins")
-    assert [(x.tolist(), u.tolist()) for x, u in guesses.mirrors(ocp)] == [([1, -1, -1], [1, -1])]
-    assert len(guesses.mirrors(nocl.load_ocp("cartpole"))) == 1
+    assert [(x.tolist(), u.tolist()) for x, u in mirrors(ocp)] == [([1, -1, -1], [1, -1])]
+    assert len(mirrors(nocl.load_ocp("cartpole"))) == 1
     shifted = ca.Function("f", [ocp.system.x, ocp.system.u], [ocp.system.f(ocp.system.x, ocp.system.u) + 0.1])
-    assert not guesses.mirrors(ocp, shifted)  # those of the dynamics that are solved with, not of the exact ones
-    assert {tuple(x[:3]) for x, _ in guesses.mirrors(nocl.load_ocp("quadrotor"))} == {
+    assert not mirrors(ocp, shifted)  # those of the dynamics that are solved with, not of the exact ones
+    assert {tuple(x[:3]) for x, _ in mirrors(nocl.load_ocp("quadrotor"))} == {
         (-1, 1, 1), (1, -1, 1), (-1, -1, 1)}  # not up and down: there is gravity
-    assert not any((x < 0).any() for x, _ in guesses.mirrors(walled()))  # the wall stands on one side
+    assert not any((x < 0).any() for x, _ in mirrors(walled()))  # the wall stands on one side
     lines = guesses.sides(ocp, np.array([-3.0, 0.0, 0.3]), 40)
     assert sorted(np.sign(line[20, 1]) for line in lines) == [-1, 1]
     assert all(ocp.h(line.T).full().min() >= 0 for line in lines)

@@ -13,6 +13,7 @@ from scipy.spatial import KDTree
 
 from nocl.data import Solution
 from nocl.solvers.ddp.solver import DDP
+from nocl.solvers.search import spread
 from nocl.support import checks
 from nocl.support.checks import Array
 
@@ -47,7 +48,7 @@ class SolutionBank:
         if np.isnan(kept.gain).any():
             raise ValueError(f"a bank follows its solutions of {ddp.ocp.system.name} by their gain, which is NaN: "
                              "take those of DDP, or of NMPC.solve(x0, gains=True)")
-        return SolutionBank(replace(kept, tried=None, dense=None), spread(ddp, kept))
+        return SolutionBank(replace(kept, tried=None, dense=None), spread(ddp.ocp, kept.x))
 
     @staticmethod
     def from_arrays(ddp: DDP, arrays: dict[str, Any]) -> SolutionBank:
@@ -129,13 +130,6 @@ class SolutionBank:
         part = np.arange(self.solution.u.shape[1] + 1) / self.solution.u.shape[1]
         return self._along(rows, start[:, None] + (self.horizon - start)[:, None] * part)
 
-    def late(self, rows: Rows, start: Array, held: NDArray[np.bool_]) -> dict[str, Array]:
-        """Guesses from t = 0 of what solutions `rows` [B] do from times `start` [B] on: as fast, and held at their last
-        node, where `held`; else stretched to the whole horizon."""
-        t = self.horizon * np.arange(self.solution.u.shape[1] + 1) / self.solution.u.shape[1]
-        stretched = start[:, None] + (1 - start / self.horizon)[:, None] * t
-        return self._along(rows, np.where(held[:, None], np.minimum(start[:, None] + t, self.horizon), stretched))
-
     def _along(self, rows: Rows, times: Array) -> dict[str, Array]:
         k, row = self._interval(times[:, :-1] + np.diff(times) / 2), rows[:, None]
         return {"u": self.solution.u[row, k], "x": self.states(rows, times), "gain": self.solution.gain[row, k]}
@@ -154,12 +148,6 @@ class SolutionBank:
     def _interval(self, t: ArrayLike) -> Rows:
         K = self.solution.u.shape[1]
         return np.clip((np.asarray(t) * K / self.horizon).astype(np.int64), 0, K - 1)
-
-
-def spread(ddp: DDP, solution: Solution) -> Array:
-    """The states' standard deviations along solutions [nx], at least 5 % of X."""
-    box = np.asarray(ddp.ocp.system.ubx) - ddp.ocp.system.lbx
-    return np.asarray(np.maximum(solution.x.std(axis=(0, 1)), 0.05 * box))
 
 
 def extend(ddp: DDP, bank: SolutionBank, x0: ArrayLike, neighbours: int = 3, t0: ArrayLike = 0.0) -> Solution:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
 from importlib.metadata import version
@@ -15,24 +15,23 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nocl.data import TINY, Solution, Trajectory
+from nocl.data import Solution, Trajectory
 from nocl.judge import check_made_for, dynamics_function
 from nocl.ocp import OCP
 from nocl.solvers.lqr import LQR
+from nocl.solvers.mirrors import Mirror, mirrors
 from nocl.solvers.nmpc import guesses as starting
 from nocl.solvers.nmpc.guesses import Guess
 from nocl.solvers.nmpc.loop import Loop
-from nocl.solvers.nmpc.search import Outcome, Search, Task, attempt
 from nocl.solvers.nmpc.sensitivity import cost_to_go, dense, second_variation
-from nocl.solvers.nmpc.transcription import BACKENDS, Transcription
+from nocl.solvers.nmpc.tasks import Outcome, Task, attempt, failure, outside, solved_by, violated_start
+from nocl.solvers.nmpc.transcription import BACKENDS, Answer, Transcription
+from nocl.solvers.search import Found, Moves, Rows, Search
 from nocl.support import checks, compiler
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
 from nocl.support.pool import Journal, Pool, do
 
-BETTER = 1e-6  # relative improvement that makes a neighbour's solution worth passing on
-FRESH = 2  # more random starts in a round, for a state of whose solves a share below SURE ended at its best
-SURE = 0.3
 KEPT = 32  # programs kept in memory
 
 
@@ -51,9 +50,9 @@ class NMPC:
     terminal : cost at the window's end in place of G: a casadi.Function (x) or (x, t) -> number, or an object with
         `value_to_casadi()`, such as a trained value function
     starts : guesses tried for each state, beyond those that `solve` is given
-    passes : rounds in which states of one batch are solved again from their neighbours' solutions, where the problem
-        has a mirror image from the mirrored ones, and from any other state's, until a round improves nothing
-    neighbours : how many in each round
+    passes : rounds in which states of one batch are solved again from other states' solutions, until a round improves
+        nothing; nocl.solvers.search says what a round tries
+    neighbours : how many of them are the nearest states', one more in each round
     constraints : "hard": path constraints at the nodes; "soft": the penalty of ocp.L_soft in the cost instead
     seed : of the random starts
     options : of the nlpsol, like {"ipopt.tol": 1e-6}
@@ -124,9 +123,9 @@ class NMPC:
         return None if self.compiled is False else compiler.cache_folder(named)
 
     @cached_property
-    def mirrors(self) -> list[tuple[Array, Array]]:
+    def mirrors(self) -> list[Mirror]:
         """Mirror images of the problem, as signs of x - x* and u - u*."""
-        return starting.mirrors(self.ocp, self.dynamics)
+        return mirrors(self.ocp, self.dynamics)
 
     def solve(self, x0: ArrayLike, guesses: Any = None, *, t0: float = 0.0, nodes: ArrayLike | None = None,
               starts: int | None = None, gains: bool = False, workers: int | str = "auto",
@@ -164,11 +163,13 @@ class NMPC:
             raise ValueError(f"starts is {n}; expected at least 1, or guesses")
         show = sys.stderr.isatty() if progress is None else progress
         journal = Journal(None if out is None else Path(out), self._run_key(rows, t, given, n, warm) if out else "")
-        run = _Run(self, rows, t, Pool(workers), journal, show)
-        run.first([[guess[i] for guess in given] for i in range(len(rows))], n, warm)
-        if n:
-            run.exchange()
-        solution = _collect(run.searches, t)
+        states = _States(self, rows, t, given, warm, Pool(workers), journal, show)
+        rounds = self.passes if n else 0
+        search = Search(states, self.ocp, self.mirrors if rounds else [], rows, t, neighbours=self.neighbours,
+                        rounds=rounds, seed=self.seed)
+        search.stage("NMPC", search.cold, np.arange(len(rows)), 0, n)
+        search.improve(n)
+        solution = states.finished(search.solution())
         return self.with_gains(solution) if gains else solution
 
     def with_gains(self, solution: Solution) -> Solution:
@@ -265,99 +266,59 @@ class _Job:
     def __call__(self, task: Task) -> Outcome:
         program, guesses = self.nmpc.program, list(task.guesses)
         if task.starts:
-            guesses += starting.starts(program, _lqr(self.nmpc.ocp), task.x0, task.t, task.starts, task.seed)
+            guesses += starting.starts(program, _lqr(self.nmpc.ocp), task.x0, task.t, task.begin, task.starts,
+                                       task.seed)
         return attempt(program, task, guesses)
 
 
-class _Run:
-    """One call of solve: a search for each state, fed by tasks."""
+class _States:
+    """The states of one call of solve, as a search asks for them: a task for each state and stage."""
 
-    def __init__(self, nmpc: NMPC, x0: Array, t: Array, pool: Pool, journal: Journal, show: bool) -> None:
-        self.nmpc, self.x0, self.t, self.pool, self.journal, self.show = nmpc, x0, t, pool, journal, show
-        self.searches = [Search(nmpc.program, x) for x in x0]
+    def __init__(self, nmpc: NMPC, x0: Array, t: Array, given: list[list[Guess]], warm: int, pool: Pool,
+                 journal: Journal, show: bool) -> None:
+        self.nmpc, self.x0, self.t, self.given, self.warm = nmpc, x0, t, given, warm
+        self.pool, self.journal, self.show = pool, journal, show
+        self.refusal = [violated_start(nmpc.program, x) for x in x0]
+        self.failed: list[Answer | None] = [None] * len(x0)  # the most feasible of each state's solves that failed
 
-    def first(self, guesses: list[list[Guess]], starts: int, warm: int) -> None:
-        """Each state from the guesses given, `warm` of them solutions, then from the built-in starts."""
-        self._do([Task(f"start-{i:06d}", i, self.x0[i], self.t, guesses[i], warm, starts, self.nmpc.seed)
-                  for i, search in enumerate(self.searches) if not search.refusal], "NMPC")
+    def begin(self, stage: int, what: str) -> None:
+        self.number, self.what = stage - 1, what
 
-    def exchange(self) -> None:
-        """Each state again from its nearest neighbours' solutions, until nothing improves or `passes` rounds."""
-        tried: set[tuple[int, int, int, float]] = set()
-        order = [list(self._nearest(i)) for i in range(len(self.x0))] if self.nmpc.passes else []
-        for round_ in range(1, self.nmpc.passes + 1):
-            tasks = [Task(f"round-{round_}-{i:06d}", i, self.x0[i], self.t, guesses)
-                     for i, search in enumerate(self.searches)
-                     if not search.refusal and (guesses := [*self._from_neighbours(i, order[i], tried),
-                                                            *self._from_afar(i, round_), *self._fresh(i, round_)])]
-            before = [search.cost for search in self.searches]
-            self._do(tasks, f"neighbours, round {round_}")
-            if not any(search.cost < cost - max(BETTER * abs(search.cost), TINY)
-                       for search, cost in zip(self.searches, before, strict=True)):
-                return
+    def cold(self, rows: Rows, first: int, count: int) -> Found:
+        """The first time also the guesses that solve was given."""
+        name, begun = (f"fresh-{self.number}", True) if self.number else ("start", False)
+        tasks = [Task(f"{name}-{i:06d}", i, self.x0[i], self.t, () if begun else [guess[i] for guess in self.given],
+                      0 if begun else self.warm, first, count, self.nmpc.seed) for i in rows]
+        return self._do(tasks)
 
-    def _nearest(self, i: int) -> Iterator[tuple[int, int]]:
-        """(state, mirror image of it, or -1 for the state itself), by their distance from state i; never itself."""
-        scale = np.where(np.ptp(self.x0, axis=0) > 0, np.ptp(self.x0, axis=0), 1.0)
-        u = np.zeros(self.nmpc.ocp.system.nu)
-        images = [self.x0] + [starting.mirrored(self.nmpc.ocp, g, self.x0, u)[0] for g in self.nmpc.mirrors]
-        distance = np.linalg.norm((np.array(images) - self.x0[i]) / scale, axis=2)  # [1 + mirrors, B]
-        for place in np.argsort(distance, axis=None, kind="stable"):
-            image, j = divmod(int(place), len(self.x0))
-            if (image, j) != (0, i):
-                yield j, image - 1
+    def follow(self, moves: Moves, guess: Callable[[Moves], dict[str, Array]]) -> Found:
+        tasks = []
+        for i in np.unique(moves.row):
+            made = guess(moves[moves.row == i])
+            guesses = [starting.from_neighbour(self.x0[i], x, u) for x, u in zip(made["x"], made["u"], strict=True)]
+            tasks.append(Task(f"round-{self.number}-{i:06d}", int(i), self.x0[i], self.t, guesses))
+        return self._do(tasks)
 
-    def _from_neighbours(self, i: int, order: list[tuple[int, int]],
-                         tried: set[tuple[int, int, int, float]]) -> Iterator[Guess]:
-        solved = [(j, image) for j, image in order if self.searches[j].best is not None]
-        for j, image in solved[: self.nmpc.neighbours]:
-            answer = self.searches[j].best
-            if answer is None or (i, j, image, answer.cost) in tried:
-                continue
-            tried.add((i, j, image, answer.cost))
-            x, u = answer.x, answer.u
-            if image >= 0:
-                x, u = starting.mirrored(self.nmpc.ocp, self.nmpc.mirrors[image], x, u)
-            yield starting.from_neighbour(self.x0[i], x, u)
+    def _do(self, tasks: Sequence[Task]) -> Found:
+        tasks = [task for task in tasks if not self.refusal[task.row]]
+        outcomes = do(_Job(self.nmpc), tasks, self.pool, self.journal, self.show, self.what)
+        for outcome in outcomes:
+            best, failed = self.failed[outcome.row], outcome.failed
+            if failed is not None and (best is None or failed.violation < best.violation):
+                self.failed[outcome.row] = failed
+        yield np.array([o.row for o in outcomes], dtype=np.int64), solved_by(self.nmpc.ocp, self.t, outcomes)
 
-    def _from_afar(self, i: int, round_: int) -> Iterator[Guess]:
-        """The solution of any other state: neighbours alone come to rest where a whole region shares a wrong basin."""
-        rng = np.random.default_rng((self.nmpc.seed, round_, i))
-        others = [j for j, search in enumerate(self.searches) if j != i and search.best is not None]
-        if others:
-            answer = self.searches[rng.choice(others)].best
-            assert answer is not None
-            yield starting.from_neighbour(self.x0[i], answer.x, answer.u)
-
-    def _fresh(self, i: int, round_: int) -> Iterator[Guess]:
-        """More random controls for a state of whose solves few ended at its best."""
-        nmpc, search = self.nmpc, self.searches[i]
-        if search.hits < SURE * len(search.costs):
-            seed = int(np.random.default_rng((nmpc.seed, round_, i, 1)).integers(2**62))
-            for u in starting.random_controls(nmpc.ocp, nmpc.intervals, FRESH, seed):
-                yield starting.controlled(nmpc.program, self.x0[i], u, self.t)
-
-    def _do(self, tasks: Sequence[Task], what: str) -> None:
-        for outcome in do(_Job(self.nmpc), tasks, self.pool, self.journal, self.show, what):
-            self.searches[outcome.row].add(outcome)
-
-
-def _collect(searches: list[Search], t: Array) -> Solution:
-    """One row for each search; NaN where there is no solution."""
-    p = searches[0].program
-    s, N, B = p.ocp.system, p.N, len(searches)
-    tried = np.full((B, max(len(search.costs) for search in searches)), np.nan)
-    blank, between = Solution.blank(np.tile(t, (B, 1)), s.nx, s.nu), np.full((B, N, 4, 2 * s.nx), np.nan)
-    for i, search in enumerate(searches):
-        tried[i, :len(search.costs)] = search.costs
-        if search.best is not None:
-            x, u, V_x = blank.x[i], blank.u[i], blank.V_x[i]
-            x[:], u[:], V_x[:] = search.best.x, search.best.u, search.best.costate
-            blank.V[i], between[i] = cost_to_go(p, t, x, u), dense(p, t, x, u, V_x)
-    return replace(
-        blank, cost=np.array([e.cost for e in searches]), success=np.array([e.best is not None for e in searches]),
-        message=np.array([e.message for e in searches]), seconds=np.array([e.seconds for e in searches]),
-        iterations=np.array([e.iterations for e in searches]), tried=tried, dense=between)
+    def finished(self, found: Solution) -> Solution:
+        """What the search found, with V, what solution(t) interpolates, and messages."""
+        p, between = self.nmpc.program, np.full((*found.u.shape[:2], 4, 2 * found.x.shape[2]), np.nan)
+        message = [why or found.message[i] + outside(p, self.x0[i]) for i, why in enumerate(self.refusal)]
+        for i in range(len(self.x0)):
+            row = (self.t, found.x[i], found.u[i])
+            if found.success[i]:
+                found.V[i], between[i] = cost_to_go(p, *row), dense(p, *row, found.V_x[i])
+            elif not self.refusal[i]:
+                message[i] = failure(p, self.x0[i], int(found.starts[i]), self.failed[i])
+        return replace(found, message=np.array(message), dense=between)
 
 
 def _is_solution(guess: Any) -> bool:

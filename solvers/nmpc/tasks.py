@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from nocl.data import SAME, TINY
+from nocl.data import Solution
+from nocl.ocp import OCP
 from nocl.solvers.nmpc.guesses import Guess
 from nocl.solvers.nmpc.transcription import FEASIBLE, NOT_A_NUMBER, STOPPED, Answer, Transcription
 from nocl.support.checks import Array
@@ -17,7 +18,7 @@ from nocl.support.checks import Array
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """Solves from one state: the guesses given, then `starts` built-in ones."""
+    """Solves from one state: the guesses given, then `starts` built-in ones, number `begin` the first of them."""
 
     name: str  # unique in a run
     row: int
@@ -25,6 +26,7 @@ class Task:
     t: Array  # [N+1]
     guesses: Sequence[Guess] = ()
     warm: int = 0  # how many of these, the first ones, are solutions of problems nearby
+    begin: int = 0
     starts: int = 0
     seed: int = 0
     size: int = 1  # states
@@ -90,52 +92,25 @@ def _second_opinion(program: Transcription, task: Task, answers: Sequence[Answer
     return [replace(answer, message=f"{answer.message}, by IPOPT after fatrop: {best.message}")]
 
 
-@dataclass(eq=False)
-class Search:
-    """All that was tried from one state, in the order of the tasks."""
+def solved_by(ocp: OCP, t: Array, outcomes: Sequence[Outcome]) -> Solution:
+    """What tasks on the nodes t [N+1] found, a row each; NaN where a task found nothing."""
+    found = Solution.blank(np.tile(t, (len(outcomes), 1)), ocp.system.nx, ocp.system.nu)
+    tried = np.full((len(outcomes), max((len(o.costs) for o in outcomes), default=0)), np.nan)
+    for i, outcome in enumerate(outcomes):
+        tried[i, :len(outcome.costs)] = outcome.costs
+        if outcome.best is not None:
+            found.x[i], found.u[i], found.V_x[i] = outcome.best.x, outcome.best.u, outcome.best.costate
+            found.cost[i], found.success[i] = outcome.best.cost, True
+    return replace(found, tried=tried, message=np.array([o.best.message if o.best else "" for o in outcomes], np.str_),
+                   seconds=np.array([o.seconds for o in outcomes]),
+                   iterations=np.array([o.iterations for o in outcomes], dtype=np.int64))
 
-    program: Transcription
-    x0: Array
-    best: Answer | None = None
-    failed: Answer | None = None
-    costs: list[float] = field(default_factory=list)
-    seconds: float = 0.0
-    iterations: int = 0
-    refusal: str = ""
 
-    def __post_init__(self) -> None:
-        self.refusal = _violated_start(self.program, self.x0)
-
-    @property
-    def cost(self) -> float:
-        return np.inf if self.best is None else self.best.cost
-
-    def add(self, outcome: Outcome) -> None:
-        self.costs += outcome.costs.tolist()
-        self.seconds += outcome.seconds
-        self.iterations += outcome.iterations
-        if outcome.best is not None and outcome.best.cost < self.cost:
-            self.best = outcome.best
-        if outcome.failed is not None and (self.failed is None or outcome.failed.violation < self.failed.violation):
-            self.failed = outcome.failed
-
-    @property
-    def hits(self) -> int:
-        if self.best is None:
-            return 0
-        near = np.array(self.costs) - self.cost <= max(SAME * abs(self.cost), TINY)
-        return int(near.sum())
-
-    @property
-    def message(self) -> str:
-        if self.refusal:
-            return self.refusal
-        if self.best is not None:
-            return self.best.message + _outside(self.program, self.x0)
-        reason, outcome = ("nothing was tried", "") if self.failed is None else \
-            (self.failed.message, self.failed.outcome)
-        return (f"no start of {len(self.costs)} converged from x0 = {_text(self.x0)}{_outside(self.program, self.x0)}: "
-                f"{reason}; try {_remedy(outcome, self.program)}")
+def failure(program: Transcription, x0: Array, starts: int, failed: Answer | None) -> str:
+    """Why none of the starts converged, by the most feasible of them."""
+    reason, outcome = ("nothing was tried", "") if failed is None else (failed.message, failed.outcome)
+    return (f"no start of {starts} converged from x0 = {_text(x0)}{outside(program, x0)}: {reason}; "
+            f"try {_remedy(outcome, program)}")
 
 
 def _remedy(outcome: str, program: Transcription) -> str:
@@ -147,7 +122,7 @@ def _remedy(outcome: str, program: Transcription) -> str:
     return "more starts, another guess, or more intervals" + soft
 
 
-def _violated_start(program: Transcription, x0: Array) -> str:
+def violated_start(program: Transcription, x0: Array) -> str:
     """Why x0 is no start at all: inside an obstacle that no control can undo."""
     if not program.n_path:
         return ""
@@ -159,7 +134,7 @@ def _violated_start(program: Transcription, x0: Array) -> str:
             f"0, by x0 = {_text(x0)} itself: move x0, or use constraints='soft'")
 
 
-def _outside(program: Transcription, x0: Array) -> str:
+def outside(program: Transcription, x0: Array) -> str:
     """A note where x0 is outside X: the exact equations hold there too, a model learned in X may not."""
     s = program.ocp.system
     out = [f"{name} = {v:.4g} outside [{low:g}, {high:g}]" for name, v, low, high in

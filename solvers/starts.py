@@ -1,0 +1,39 @@
+"""Random controls that a search starts from, and when their rollouts are too wild to start from."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from nocl.ocp import OCP
+from nocl.sampling import Seed
+from nocl.support.checks import Array
+from nocl.system import System
+
+WAVES = 8  # half waves in a random control, the slow ones the largest
+QUIETEST = 0.003  # its smallest amplitude, in half widths of U
+FAR = 1.5  # widths of X from its middle: beyond, a rollout costs most and gives least
+HALVINGS = 6  # of a control's distance to u*, until its rollout stays there
+
+
+def smooth(system: System, K: int, n: int, rng: np.random.Generator) -> Array:
+    """n random sums of half waves [n, K, nu], of QUIETEST to 1 half widths of U."""
+    order = np.arange(WAVES)
+    waves = np.cos(np.pi * order[:, None] * (np.arange(K) + 0.5) / K) / (1 + order)[:, None]
+    shape = np.einsum("bmk,kt->btm", rng.standard_normal((n, system.nu, WAVES)), waves)
+    size = np.exp(rng.uniform(np.log(QUIETEST), 0.0, (n, 1, 1)))
+    return size * (system.ubu - system.lbu) / 2 * shape
+
+
+def random_controls(ocp: OCP, K: int, n: int, seed: Seed) -> Array:
+    """n smooth random controls [n, K, nu] in U, about u* or the middle of U, small to full amplitude."""
+    s, rng = ocp.system, np.random.default_rng(seed)
+    shape = smooth(s, K, n, rng)
+    base = np.where(rng.random((n, 1, 1)) < 0.5, np.asarray(ocp.u_goal), (s.lbu + s.ubu) / 2)
+    return np.ascontiguousarray(np.clip(base + shape, s.lbu, s.ubu))
+
+
+def near(system: System, x: Array) -> Array:
+    """Whether trajectories x [..., K+1, nx] stay near X, or as near as they began; False where they are not finite."""
+    middle = (system.lbx + system.ubx) / 2
+    far = FAR * np.maximum(system.ubx - system.lbx, np.abs(x[..., :1, :] - middle))
+    return np.asarray((np.abs(x - middle) < far).all(axis=(-2, -1)))
