@@ -283,3 +283,11 @@ def test_a_region_that_shares_a_wrong_basin_is_told_by_states_from_afar():
 def test_no_states_are_refused():
     with pytest.raises(ValueError, match=r"x0 has shape \(0, 2\); expected at least one state"):
         NMPC(two_valleys(), 20).solve(np.zeros((0, 2)))
+
+
+def test_more_starts_never_end_higher_where_fatrop_is_stuck_from_all():
+    """From this state fatrop converges from none, and IPOPT from the most feasible point alone ended at 29."""
+    x0 = [1.86974381, 1.09838893, -0.68094126, -3.1274743]
+    one, four = (NMPC(nocl.load_ocp("cartpole"), 40, starts=n, passes=0).solve(x0) for n in (1, 4))
+    assert four.success.all()
+    assert four.cost[0] <= one.cost[0] * (1 + 1e-6)

@@ -80,16 +80,24 @@ def attempt(program: Transcription, task: Task, guesses: Sequence[Guess]) -> Out
 
 
 def _second_opinion(program: Transcription, task: Task, answers: Sequence[Answer]) -> list[Answer]:
-    """Where fatrop got stuck from all starts: IPOPT from its most feasible point, to solve it or to say why not."""
+    """Where fatrop got stuck from all starts: IPOPT from where it got to, to solve it or to say why not.
+
+    From its most feasible point, and from its first one: the most feasible may lead to a poor optimum, and more starts
+    must not end higher than one.
+    """
     if program.backend != "fatrop" or any(a.success for a in answers):
         return []
     stuck = [a for a in answers if a.outcome != STOPPED and np.isfinite(a.x).all() and
              np.isfinite(a.u).all()]
     if not stuck:
         return []
-    best = min(stuck, key=lambda a: a.violation)
-    answer = program.second.solve(task.x0, task.t, best.x, best.u)
-    return [replace(answer, message=f"{answer.message}, by IPOPT after fatrop: {best.message}")]
+    chosen = {id(a): a for a in (min(stuck, key=lambda a: a.violation), stuck[0])}
+    return [_by_ipopt(program, task, a) for a in chosen.values()]
+
+
+def _by_ipopt(program: Transcription, task: Task, start: Answer) -> Answer:
+    answer = program.second.solve(task.x0, task.t, start.x, start.u)
+    return replace(answer, message=f"{answer.message}, by IPOPT after fatrop: {start.message}")
 
 
 def solved_by(ocp: OCP, t: Array, outcomes: Sequence[Outcome]) -> Solution:
