@@ -102,10 +102,10 @@ def test_without_a_control_cost_nocls_default_says_why_it_refuses(monkeypatch, t
     made = QUADROTOR_TABLE.make(Plan(n=2, quick=True), Place("quadrotor", "r0"), tmp_path)
     assert made.error == []
     assert "refused: " in made.made
-    assert "not convex in the controls" in made.made
+    assert "cost and dynamics are linear in u1" in made.made
     entry = next(e for e in QUADROTOR_TABLE.entries([made]) if e.way == "r0")
     assert math.isnan(entry.error)
-    assert "refused: no problem of quadrotor" in QUADROTOR_TABLE.markdown([entry])
+    assert "refused: train: cost and dynamics are linear in" in QUADROTOR_TABLE.markdown([entry])
 
 
 def test_ddp_counts_its_forward_evaluations():
