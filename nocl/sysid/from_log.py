@@ -17,7 +17,7 @@ from nocl.nets import MLP, FeatureNet
 from nocl.support.checks import Array
 from nocl.sysid import fitting
 from nocl.sysid.logs.derivatives import labels
-from nocl.sysid.logs.log import Log, Run
+from nocl.sysid.logs.log import Log, Recording
 from nocl.sysid.logs.shooting import Stage, fit_simulation, lengths, spread_of
 from nocl.sysid.networks import assemble
 from nocl.sysid.progress import Progress
@@ -52,7 +52,7 @@ def fit_log(log: Log, parts: Structure, settings: LogSettings, seed: int,
     return net.requires_grad_(False), stages
 
 
-def first_states(log: Log) -> list[tuple[Array, Run]]:
+def first_states(log: Log) -> list[tuple[Array, Recording]]:
     """Each run with its smoothed states at all samples but the last."""
     return [(run.smooth.x[:-1], run) for run in log]
 

@@ -26,7 +26,7 @@ from torch.func import functional_call
 from nocl.nets import FeatureNet
 from nocl.support.checks import Array
 from nocl.sysid.logs.derivatives import noise
-from nocl.sysid.logs.log import Log, Run
+from nocl.sysid.logs.log import Log, Recording
 from nocl.sysid.logs.slopes import Slopes
 from nocl.translate.rk4 import rk4_interval
 
@@ -90,7 +90,7 @@ def spread_of(values: Array) -> Array:
     return np.where(spread > 1e-12 * np.abs(values).max(axis=0), spread, 1.0)
 
 
-def _window(run: Run, k: int, m: int) -> tuple[Array, Array, Array]:
+def _window(run: Recording, k: int, m: int) -> tuple[Array, Array, Array]:
     """(logged states, controls, steps) of the window from sample k on, filled up to m steps."""
     n = min(m, len(run) - 1 - k)
     states, controls, h = np.full((m + 1, run.x.shape[1]), np.nan), np.zeros((m, run.u.shape[1])), np.zeros(m)
