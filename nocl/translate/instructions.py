@@ -1,4 +1,4 @@
-"""SX functions as instruction lists: the one walker behind torch, C and JSON, and functions as plain data."""
+"""SX functions as instruction lists: the one walker behind torch, JAX, C, ONNX and text; functions as plain data."""
 
 from __future__ import annotations
 
