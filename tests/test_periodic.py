@@ -7,6 +7,7 @@ import pytest
 import nocl
 from nocl.solvers.cnd.features import features
 from nocl.solvers.lqr import LQR
+from nocl.solvers.nmpc.solver import NMPC
 
 TURN = np.array([2 * np.pi, 0.0])
 
@@ -67,6 +68,17 @@ def test_features_do_not_tell_images_apart():
         np.testing.assert_allclose(phi((x[:9] + TURN).T, t[None, :9]).full(), at, atol=1e-9)
         raw = features(pendulum(lambda theta, omega: theta**2 + omega**2), x, t, plain=plain)
         assert raw.numel_out(0) > phi.numel_out(0)
+
+
+def test_nmpc_is_the_same_from_images():
+    """Starts go to the nearest image of the goal."""
+    nmpc = NMPC(pendulum(goal=3.1), 30, starts=3, passes=0)
+    x0 = np.array([-2.9, 0.3])
+    here, there = (nmpc.solve(x, progress=False) for x in (x0, x0 + TURN))
+    assert here.success.all()
+    np.testing.assert_allclose(here.cost, there.cost, rtol=1e-6)
+    np.testing.assert_allclose(here.u, there.u, atol=1e-4)
+    assert here.cost[0] < 0.2  # the short way
 
 
 @pytest.mark.slow

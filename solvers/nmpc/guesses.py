@@ -27,7 +27,7 @@ def starts(program: Transcription, lqr: LQR | None, x0: Array, t: Array, begin: 
     found = [(np.tile(x0, (N + 1, 1)), u_goal)]
     if begin + n > 1 and lqr is not None:
         found += lqr_rollout(program, lqr, x0, t)
-    found.append((x0 + np.linspace(0.0, 1.0, N + 1)[:, None] * (ocp.x_goal - x0), u_goal))
+    found.append((x0 + np.linspace(0.0, 1.0, N + 1)[:, None] * -ocp.from_goal(x0), u_goal))
     found += [(x, u_goal) for x in (sides(ocp, x0, N) if program.n_path else [])]
     random = (random_controls(ocp, N, 1, np.random.default_rng([seed, number]))[0]
               for number in range(max(begin, len(found)), begin + n))
@@ -94,13 +94,13 @@ def controller_rollout(program: Transcription, controller: Controller, x0: Array
 def sides(ocp: OCP, x0: Array, N: int) -> list[Array]:
     """Lines from x0 to the goal [N+1, nx], bent round each obstacle that the straight one crosses, on either side."""
     s, found = np.linspace(0.0, 1.0, N + 1)[:, None], list[Array]()
-    line = x0 + s * (ocp.x_goal - x0)
+    line = x0 - s * ocp.from_goal(x0)
     for i in range(len(ocp.path_constraints)):
         values = ocp.h(line.T).full()[i]
         k = int(np.argmin(values))
         if values[k] >= 0:
             continue
-        across = _across(ocp.functions.h_derivatives(line[k], 0)[1], i, ocp.x_goal - x0)
+        across = _across(ocp.functions.h_derivatives(line[k], 0)[1], i, -ocp.from_goal(x0))
         if across is None:
             continue
         for side in (across, -across):
