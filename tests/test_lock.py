@@ -9,6 +9,7 @@ import time
 
 import pytest
 
+from nocl.cli import main
 from nocl.solvers.nmpc.solver import NMPC
 from nocl.support.lock import NAME, alone
 from nocl.systems import load_ocp
@@ -82,3 +83,13 @@ def test_a_folder_that_cannot_be_made_says_so(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match=r"cannot be written .*name another one"), alone(tmp_path / "file" / "run"):
         pass
+
+
+@pytest.mark.parametrize("words", [["solve", "double_integrator", "--n", "1"], ["run", "double_integrator", "--quick"],
+                                   ["identify", "double_integrator"], ["train", "double_integrator", "--exact"]])
+def test_a_command_in_a_folder_where_another_is_at_work_says_so(tmp_path, capsys, words):
+    folder = tmp_path / "solutions" if words[0] == "solve" else tmp_path
+    with alone(folder):
+        assert main([*words, "--out", str(tmp_path)]) == 2
+    assert "another run is at work" in capsys.readouterr().err
+    assert [p.name for p in tmp_path.rglob("*") if p.is_file()] == []  # nothing was written

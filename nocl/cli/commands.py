@@ -15,6 +15,7 @@ from nocl import __version__
 from nocl.cli import arguments, reproduce
 from nocl.solvers import registry
 from nocl.support.fields import EFFORTS
+from nocl.support.lock import alone
 from nocl.systems import NAMES, load_ocp
 
 if TYPE_CHECKING:
@@ -175,9 +176,10 @@ def _run(args: argparse.Namespace) -> None:
     stages = Stages(ocp, out, args.seed, args.effort)
     stages.check(exact=args.exact)
     _refuse(ocp, args.methods, registry.Options(args.intervals, args.seed))
-    cnd = stages.train(exact=args.exact)
-    failed = _told(lambda: stages.export(cnd, out / "export", ("casadi", "c"), QUICK_PROOF))
-    stages.compare(cnd, out / "report", args.methods, args.n, args.intervals)
+    with alone(out):
+        cnd = stages.train(exact=args.exact)
+        failed = _told(lambda: stages.export(cnd, out / "export", ("casadi", "c"), QUICK_PROOF))
+        stages.compare(cnd, out / "report", args.methods, args.n, args.intervals)
     if failed:
         raise failed
 
@@ -198,12 +200,13 @@ def _identify(args: argparse.Namespace) -> None:
     ocp, out = _problem(args)
     stages = Stages(ocp, out, args.seed, args.effort)
     stages.check(exact=False)
-    if args.data is not None:
-        stages.identify_log(args.data, args.known, args.control_affine, args.hold_controls)
-    elif args.known or args.control_affine or args.hold_controls:
+    if args.data is None and (args.known or args.control_affine or args.hold_controls):
         raise ValueError("--known, --control-affine and --hold-controls are for logs: name one by --data")
-    else:
-        stages.identify()
+    with alone(out):
+        if args.data is None:
+            stages.identify()
+        else:
+            stages.identify_log(args.data, args.known, args.control_affine, args.hold_controls)
 
 
 def _train(args: argparse.Namespace) -> None:
@@ -212,14 +215,16 @@ def _train(args: argparse.Namespace) -> None:
     ocp, out = _problem(args)
     stages = Stages(ocp, out, args.seed, args.effort)
     stages.check(exact=args.exact)
-    stages.train(exact=args.exact)
+    with alone(out):
+        stages.train(exact=args.exact)
 
 
 def _solve(args: argparse.Namespace) -> None:
     from nocl.cli.run_folder import solve  # torch
 
     ocp, out = _problem(args)
-    solve(ocp, out / "solutions", args.solver, args.n, args.seed, args.intervals, args.workers)
+    with alone(out / "solutions"):
+        solve(ocp, out / "solutions", args.solver, args.n, args.seed, args.intervals, args.workers)
 
 
 def _export(args: argparse.Namespace) -> None:
@@ -241,7 +246,8 @@ def _compare(args: argparse.Namespace) -> None:
     arguments.check_out(out)
     seed = int(cnd.card.get("seed", 0)) if args.seed is None else args.seed
     _refuse(cnd.ocp, args.methods, registry.Options(args.intervals, seed))
-    Stages(cnd.ocp, run, seed).compare(cnd, out, args.methods, args.n, args.intervals, args.hold, args.robust)
+    with alone(run):  # where outcomes so far are kept
+        Stages(cnd.ocp, run, seed).compare(cnd, out, args.methods, args.n, args.intervals, args.hold, args.robust)
 
 
 def _refuse(ocp: OCP, methods: Sequence[str], options: registry.Options) -> None:
