@@ -16,7 +16,7 @@ import nocl
 from nocl.cli.commands import parser
 
 VIEW = ROOT / "tests/mission/users_view.py"
-SOURCES = [p for folder in ("nocl", "systems", "solvers", "comparisons", "benchmarks", "tests")
+SOURCES = [p for folder in ("nocl", "systems", "solvers", "comparisons", "benchmarks")
            for p in sorted((ROOT / folder).rglob("*.py"))]
 FILES = {".py", ".md", ".json", ".h", ".js", ".css", ".html", ".png", ".toml", ".yml"}
 MADE = {"runs", "build", "out", "cells", "tables", "figures", "export", "work", "report", "checkpoint"}  # by commands
@@ -85,10 +85,13 @@ def test_files_and_links_are_there(page):
     assert not missing, f"{page.name} names {missing}: name files from the top of the repository"
 
 
+OLD = {".to_c"}  # the mark of exported files, by which those of earlier versions are known too
+
+
 @pytest.mark.parametrize("path", [*PAGES, *SOURCES], ids=lambda p: str(p.relative_to(ROOT)))
 def test_names_of_nocl_are_there(path):
     """Dotted names in prose, docstrings and code: nocl.solvers.NMPC."""
-    names = set(re.findall(r"(?<![\w./-])nocl((?:\.[a-zA-Z]\w*)+)(?![\w/])", path.read_text()))
+    names = set(re.findall(r"(?<![\w./-])nocl((?:\.[a-zA-Z]\w*)+)(?![\w/])", path.read_text())) - OLD
     missing = sorted(name for name in names if not there(name[1:].split(".")))
     assert not missing, f"{path.name} names {['nocl' + m for m in missing]}"
 
@@ -97,5 +100,5 @@ def there(parts: list[str]) -> bool:
     try:
         reduce(getattr, parts, nocl)
     except AttributeError:
-        return False
+        return parts[0] == "cli" and (ROOT / "nocl" / "/".join(parts)).with_suffix(".py").is_file()  # not handed on
     return True

@@ -19,7 +19,7 @@ def hand_on(package: str, names: Mapping[str, str]) -> tuple[Callable[[str], Any
     def known() -> list[str]:
         module = sys.modules[package]
         modules = [m.name for m in iter_modules(module.__path__) if not m.name.startswith("_")]
-        return sorted({*getattr(module, "__all__", ()), *names, *modules})
+        return sorted({*vars(module).get("__all__", ()), *names, *modules})
 
     def get(name: str) -> Any:
         if name in names:

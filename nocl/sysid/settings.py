@@ -33,7 +33,7 @@ class Budget:
 
     @staticmethod
     def plain(variables: int) -> Budget:
-        """Of one plain network of many variables with Jacobian labels (nocl.sysid_plain), one to two minutes."""
+        """Of one plain network of many variables with Jacobian labels (nocl.sysid.plain), one to two minutes."""
         return Budget(96 if variables <= 6 else 128, 15_000, 512, 0, 512)
 
 
