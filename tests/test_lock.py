@@ -79,6 +79,17 @@ def test_a_solver_refuses_a_folder_in_which_another_is_at_work(tmp_path):
     assert (again.cost == first.cost).all()
 
 
+def test_folders_in_which_nothing_was_written_go_again(tmp_path):
+    """Those that the lock made, and no others."""
+    (tmp_path / "mine").mkdir()
+    with alone(tmp_path / "mine" / "a" / "b"):
+        pass
+    assert list(tmp_path.rglob("*")) == [tmp_path / "mine"]
+    with alone(tmp_path / "mine" / "a" / "b"):
+        (tmp_path / "mine" / "a" / "kept").touch()
+    assert {path.name for path in tmp_path.rglob("*")} == {"mine", "a", "kept"}
+
+
 def test_a_folder_that_cannot_be_made_says_so(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match=r"cannot be written .*name another one"), alone(tmp_path / "file" / "run"):

@@ -15,14 +15,14 @@ NAME = ".nocl-lock"
 def alone(folder: Path | None) -> Iterator[None]:
     """While it lasts no other run works in `folder` (made if missing); ValueError where one is at work there already.
 
-    None stands for no folder, which needs no lock. The lock's file is gone afterwards, and may stay after a kill:
-    it holds no lock then.
+    None stands for no folder, which needs no lock. The lock's file is gone afterwards, and so are folders that were
+    made for it where nothing was written; after a kill they may stay, and hold no lock.
     """
     if folder is None:
         yield
         return
+    new = [path for path in (folder, *folder.parents) if not path.exists()]
     try:
-        folder.mkdir(parents=True, exist_ok=True)
         file = _locked(folder / NAME)
     except OSError as error:
         raise ValueError(f"{folder} cannot be written ({error.strerror}); expected a folder for a run: make room, or "
@@ -32,12 +32,26 @@ def alone(folder: Path | None) -> Iterator[None]:
     finally:
         (folder / NAME).unlink(missing_ok=True)  # while it is still held: whoever waits for it then makes a new one
         os.close(file)
+        _remove_empty(new)
+
+
+def _remove_empty(folders: list[Path]) -> None:
+    """Removes those that are empty, the innermost first."""
+    for folder in folders:
+        try:
+            folder.rmdir()
+        except OSError:  # it holds something, or another run has begun there
+            return
 
 
 def _locked(path: Path) -> int:
     """An open descriptor that holds the lock of the file that `path` names at this moment."""
     while True:
-        file = os.open(path, os.O_CREAT | os.O_RDWR, 0o644)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            file = os.open(path, os.O_CREAT | os.O_RDWR, 0o644)
+        except FileNotFoundError:  # a run that ended removed the empty folder in between
+            continue
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
