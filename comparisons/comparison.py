@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nocl.comparisons.judging import Disturbance, Judgement, Judging, judge
-from nocl.comparisons.methods import Run, Solving, checked, is_count, rates_of, runs_of
+from nocl.comparisons.methods import MethodRun, Solving, checked, is_count, rates_of, runs_of
 from nocl.comparisons.report.report import Report
 from nocl.comparisons.report.results import (
     Judged,
@@ -74,7 +74,7 @@ def initial_states(ocp: OCP, n: int, x0: ArrayLike | None, seed: int) -> Array:
     return rows
 
 
-def _judged(run: Run, judgement: Judgement, x0: Array) -> Judged:
+def _judged(run: MethodRun, judgement: Judgement, x0: Array) -> Judged:
     s, solved = judgement.simulation, run.solved
     solves = np.ones(len(x0)) if solved is None else solved.solves
     predicted = _predicted(run.method, x0) if solved is None else solved.predicted

@@ -19,9 +19,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nocl.comparisons.judging import Disturbance, Judgement, Judging, judge, key_of
-from nocl.comparisons.methods import Run, Solving, at_rate, checked, folder_name, how, runs_of
+from nocl.comparisons.methods import MethodRun, Solving, at_rate, checked, folder_name, how, runs_of
 from nocl.comparisons.reference import SLOTS, Reference, resolved
-from nocl.comparisons.report.findings import Loss, Robustness, Scenario
+from nocl.comparisons.report.findings import Robustness, Scenario, ScenarioLoss
 from nocl.comparisons.report.results import VIOLATION
 from nocl.judge import dynamics_function, simulate
 from nocl.ocp import OCP
@@ -156,7 +156,7 @@ class _Study:
 
     def real_time(self, calm: Sequence[Judgement], best: Array) -> Scenario:
         """Each loop at the rate that its measured time allows, that late; laws that answer at once continuously."""
-        T, most, runs, delays = self.ocp.horizon, self.settings.fastest, list[Run](), list[float]()
+        T, most, runs, delays = self.ocp.horizon, self.settings.fastest, list[MethodRun](), list[float]()
         for run, judgement in zip(self.runs, calm, strict=True):
             ms = judgement.ms_per_control[np.isfinite(judgement.ms_per_control)]
             seconds = float(np.quantile(ms, 0.95)) / 1e3 if ms.size else 0.0
@@ -171,11 +171,11 @@ class _Study:
                 f"is its delay, and it is asked again when it has answered, {most} times at most.")
         return self.play("real time", text, runs, best, delays=delays)
 
-    def play(self, name: str, text: str, runs: Sequence[Run], best: Array, delays: Sequence[float] | None = None,
+    def play(self, name: str, text: str, runs: Sequence[MethodRun], best: Array, delays: Sequence[float] | None = None,
              **disturbance: Any) -> Scenario:
         return self.scenario(name, text, runs, self.judged(name, runs, delays, **disturbance), best, delays)
 
-    def judged(self, name: str, runs: Sequence[Run], delays: Sequence[float] | None = None,
+    def judged(self, name: str, runs: Sequence[MethodRun], delays: Sequence[float] | None = None,
                **disturbance: Any) -> list[Judgement]:
         late = [0.0 if run.solved is not None else d for run, d in
                 zip(runs, delays or [0.0] * len(runs), strict=True)]
@@ -184,13 +184,13 @@ class _Study:
         folder = None if self.out is None else self.out / f"{folder_name(name)}-{key_of(job)[:12]}"
         return judge(job, self.workers, folder, self.progress, name)
 
-    def scenario(self, name: str, text: str, runs: Sequence[Run], judgements: Sequence[Judgement], best: Array,
+    def scenario(self, name: str, text: str, runs: Sequence[MethodRun], judgements: Sequence[Judgement], best: Array,
                  delays: Sequence[float] | None = None) -> Scenario:
         losses = []
         for run, j, d in zip(runs, judgements, delays or [0.0] * len(runs), strict=True):
             ok = np.asarray(j.simulation.success & ~(j.simulation.clearance < -VIOLATION), dtype=bool)
             said = run.how if run.solved is not None else how(run.hold, d)
-            losses.append(Loss(run.name, said, j.simulation.cost, best, ok, j.ms_per_control))
+            losses.append(ScenarioLoss(run.name, said, j.simulation.cost, best, ok, j.ms_per_control))
         return Scenario(name, text, tuple(losses))
 
 

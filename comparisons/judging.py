@@ -15,7 +15,7 @@ import cloudpickle
 import numpy as np
 from numpy.typing import NDArray
 
-from nocl.comparisons.methods import STAGES, Run, said
+from nocl.comparisons.methods import STAGES, MethodRun, said
 from nocl.judge import Simulation, simulate
 from nocl.ocp import OCP
 from nocl.solvers.nmpc.loop import Loop
@@ -50,7 +50,7 @@ class Judgement:
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class Share:
     """Some states of one run; a task of nocl.support.pool."""
 
     name: str
@@ -61,17 +61,17 @@ class Part:
     def size(self) -> int:
         return len(self.rows)
 
-    def outcome(self, arrays: Mapping[str, Array]) -> JudgedPart:
-        """What JudgedPart.arrays() kept."""
+    def outcome(self, arrays: Mapping[str, Array]) -> JudgedShare:
+        """What JudgedShare.arrays() kept."""
         values: dict[str, Any] = dict(arrays)
         times = [values.pop(f.name) for f in fields(Judgement) if f.name != "simulation"]
         values["message"] = [str(m) for m in values["message"]]
-        return JudgedPart(self.name, self.size, Judgement(Simulation(**values), *times))
+        return JudgedShare(self.name, self.size, Judgement(Simulation(**values), *times))
 
 
 @dataclass(frozen=True, eq=False)
-class JudgedPart:
-    """The outcome of a Part."""
+class JudgedShare:
+    """The outcome of a Share."""
 
     name: str
     size: int
@@ -89,7 +89,7 @@ class Judging:
 
     ocp: OCP
     x0: Array
-    runs: Sequence[Run]
+    runs: Sequence[MethodRun]
     disturbance: Disturbance
     delays: Sequence[float]
     timed: bool = True
@@ -97,9 +97,9 @@ class Judging:
     def build(self) -> None:
         """Nothing is shared by the parts."""
 
-    def __call__(self, part: Part) -> JudgedPart:
+    def __call__(self, part: Share) -> JudgedShare:
         run, delay = self.runs[part.run], self.delays[part.run]
-        return JudgedPart(part.name, part.size, self.judge(run, part.rows, delay))
+        return JudgedShare(part.name, part.size, self.judge(run, part.rows, delay))
 
     def __reduce__(self) -> tuple[Any, ...]:
         """By cloudpickle, so that users' functions reach processes too."""
@@ -107,7 +107,7 @@ class Judging:
                         replace(run.solved, plan=None)) for run in self.runs]  # type: ignore[arg-type]
         return _unpickled, (cloudpickle.dumps((self.ocp, self.x0, slim, self.disturbance, self.delays, self.timed)),)
 
-    def judge(self, run: Run, rows: Rows, delay: float) -> Judgement:
+    def judge(self, run: MethodRun, rows: Rows, delay: float) -> Judgement:
         if run.solved is not None:
             return self._plan(run, rows)
         try:
@@ -120,7 +120,7 @@ class Judging:
     def _nodes(self, K: int) -> Array:
         return np.linspace(0.0, self.ocp.horizon, K + 1)
 
-    def _feedback(self, run: Run, rows: Rows, delay: float) -> Judgement:
+    def _feedback(self, run: MethodRun, rows: Rows, delay: float) -> Judgement:
         x0, controller, d = self.x0[rows], run.controller, self.disturbance
         if d.noise is not None and run.hold is not None:
             controller = _Noisy(controller, self.ocp.horizon, run.hold, _noise(d, rows, run.hold))
@@ -134,7 +134,7 @@ class Judging:
         free = isinstance(run.controller, ca.Function)
         return Judgement(s, first, median, np.full(len(rows), 0.0 if free else np.nan))
 
-    def _plan(self, run: Run, rows: Rows) -> Judgement:
+    def _plan(self, run: MethodRun, rows: Rows) -> Judgement:
         """Controls in open loop; states without controls keep the solver's message."""
         assert run.solved is not None
         message = [run.solved.message[i] for i in rows]
@@ -154,7 +154,7 @@ def judge(job: Judging, workers: int | str, out: Path | None, progress: bool | N
     """All runs of a job on all its states; with `out` what is there already is taken from there."""
     B = len(job.x0)
     rows = np.array_split(np.arange(B), min(B, PARTS))
-    parts = [Part(f"run-{m}-{i:02d}", m, part) for i, part in enumerate(rows) for m in range(len(job.runs))]
+    parts = [Share(f"run-{m}-{i:02d}", m, part) for i, part in enumerate(rows) for m in range(len(job.runs))]
     journal = Journal(out, key_of(job) if out is not None else "", "a comparison")
     show = sys.stderr.isatty() if progress is None else progress
     done = do(job, parts, Pool(_possible(job, workers)), journal, show, what)

@@ -18,7 +18,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from nocl.comparisons.report.results import Plan, count
+from nocl.comparisons.report.results import Planned, count
 from nocl.data import Solution
 from nocl.judge import check_made_for, policy_function
 from nocl.ocp import OCP
@@ -31,7 +31,7 @@ Rates = tuple[int | None, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class MethodRun:
     """One method at one rate."""
 
     name: str
@@ -68,7 +68,7 @@ class Solved:
     solves: Array  # [B]
     predicted: Array  # [B]
     evaluations: Array  # [B]
-    plan: Plan
+    plan: Planned
     message: list[str]  # [B], "" or why there is nothing to judge
 
 
@@ -106,7 +106,7 @@ def is_count(value: Any) -> bool:
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(value >= 1)
 
 
-def runs_of(ocp: OCP, methods: Mapping[str, Any], x0: Array, rates: Rates, solving: Solving) -> list[Run]:
+def runs_of(ocp: OCP, methods: Mapping[str, Any], x0: Array, rates: Rates, solving: Solving) -> list[MethodRun]:
     """The runs of all methods, in order; ValueError for what is no method, before anything is solved."""
     for name, method in methods.items():
         _check(ocp, name, method, x0)
@@ -144,15 +144,15 @@ def _held_name(name: str, rate: int | None) -> str:
     return name if rate is None else f"{name} ({count(rate, 'hold')})"
 
 
-def _runs(ocp: OCP, name: str, method: Any, x0: Array, rates: Rates, solving: Solving) -> list[Run]:
+def _runs(ocp: OCP, name: str, method: Any, x0: Array, rates: Rates, solving: Solving) -> list[MethodRun]:
     names = _names(ocp, name, method, rates)
     if is_plan(method):
         parts = [method] if isinstance(method, Solution) else solve(method, name, x0, solving)
         return [planned(ocp, name, method, parts, len(x0))]
     policy = _policy(ocp, name, method)
     if policy is not None:
-        return [Run(n, how(rate), method, policy, rate) for n, rate in zip(names, rates, strict=True)]
-    return [Run(n, how(rate), method, at_rate(method, rate), rate)
+        return [MethodRun(n, how(rate), method, policy, rate) for n, rate in zip(names, rates, strict=True)]
+    return [MethodRun(n, how(rate), method, at_rate(method, rate), rate)
             for n, rate in zip(names, _sampled(method, rates), strict=True)]
 
 
@@ -225,12 +225,12 @@ def solve(solver: Any, name: str, x0: Array, solving: Solving) -> list[Solution 
     return [solution]
 
 
-def planned(ocp: OCP, name: str, method: Any, parts: Sequence[Solution | str], B: int) -> Run:
+def planned(ocp: OCP, name: str, method: Any, parts: Sequence[Solution | str], B: int) -> MethodRun:
     """The run of solutions that stand in the order of the states; a str is what a solve raised."""
     K = max((part.u.shape[1] for part in parts if not isinstance(part, str)), default=1)
     nx, nu = ocp.system.nx, ocp.system.nu
     message, u = list[str](), np.full((B, K, nu), np.nan)
-    plan = Plan(np.full((B, K + 1, nx), np.nan), np.full((B, K + 1, nx), np.nan))
+    plan = Planned(np.full((B, K + 1, nx), np.nan), np.full((B, K + 1, nx), np.nan))
     ms, predicted, evaluations, solves = *np.full((3, B), np.nan), np.ones(B)
     for s in parts:
         i = len(message)
@@ -246,7 +246,7 @@ def planned(ocp: OCP, name: str, method: Any, parts: Sequence[Solution | str], B
         message += _unsolved(ocp, s)
     u[[bool(m) for m in message]] = np.nan
     solved = Solved(ms, solves, predicted, evaluations, plan, message)
-    return Run(name, f"open loop, held on {count(K, 'interval')}", method, u, solved=solved)
+    return MethodRun(name, f"open loop, held on {count(K, 'interval')}", method, u, solved=solved)
 
 
 def _unsolved(ocp: OCP, solution: Solution) -> list[str]:

@@ -163,7 +163,7 @@ class NeuralOC:
     def __init__(self, ocp: OCP, value_net: ValueNet, card: Mapping[str, Any] | None = None) -> None:
         self.ocp, self.card = ocp, dict(card or {})
         self.value_net = value_net.double().eval().requires_grad_(False)
-        self._minimiser = _minimiser(ocp)
+        self._minimiser = minimiser_of(ocp)
         self._u = to_torch(self._minimiser)
 
     def __call__(self, x: ArrayLike, t: ArrayLike = 0.0) -> Array:
@@ -245,7 +245,7 @@ def train_neural_oc(ocp: OCP, settings: NeuralOCSettings | None = None, *, dynam
     settings = settings or NeuralOCSettings()
     with one_thread():
         start = time.perf_counter()
-        trainer = _Trainer(ocp, settings, seed)
+        trainer = Trainer(ocp, settings, seed)
         trainer.train(progress)
         seconds = time.perf_counter() - start
     if not math.isfinite(trainer.lowest):
@@ -263,16 +263,16 @@ def train_neural_oc(ocp: OCP, settings: NeuralOCSettings | None = None, *, dynam
 
 def applicable(ocp: OCP) -> None:
     """ValueError, at once, for a problem that NeuralOC is not for: see train_neural_oc."""
-    _minimiser(ocp)
+    minimiser_of(ocp)
     _scale(ocp)
 
 
-class _Trainer:
+class Trainer:
     """One training: the problem in torch, its network and random numbers, the best network so far."""
 
     def __init__(self, ocp: OCP, settings: NeuralOCSettings, seed: int, dtype: torch.dtype = torch.float32) -> None:
         self.ocp, self.settings, self.dtype = ocp, settings, dtype
-        field, self.final = _characteristics(ocp), to_torch(_terminal(ocp))
+        field, self.final = characteristics(ocp), to_torch(_terminal(ocp))
         self.field = FusedFunction(field) if settings.fused else to_torch(field)
         self.rng = np.random.default_rng(seed)
         with torch.random.fork_rng(devices=[]):
@@ -350,7 +350,7 @@ class _Trainer:
                              "horizon, narrower initial_states, tighter control bounds")
 
 
-def _minimiser(ocp: OCP) -> ca.Function:
+def minimiser_of(ocp: OCP) -> ca.Function:
     """(x, costate) -> u*, in SX."""
     function = minimiser(ocp)
     if function is None:
@@ -360,9 +360,9 @@ def _minimiser(ocp: OCP) -> ca.Function:
     return at.function("u", {"u": at.call(function)[0]})
 
 
-def _characteristics(ocp: OCP) -> ca.Function:
+def characteristics(ocp: OCP) -> ca.Function:
     """(x, costate) in one vector -> (f, L, H) at u*(x, costate)."""
-    best = _minimiser(ocp)
+    best = minimiser_of(ocp)
     at = Arguments.of(best)
     here = at.given(u=at.call(best))
     f, L = here.call(ocp.functions.f), here.call(ocp.functions.L_soft)

@@ -16,7 +16,7 @@ from nocl.ocp import OCP
 
 @dataclass(frozen=True)
 class Options:
-    """What a method may be told; it gets those that its entry names in `takes`."""
+    """Options of a method; it gets those that its entry names in `takes`."""
 
     intervals: int = 80  # of a plan's held controls
     seed: int = 0  # of what is random in the method

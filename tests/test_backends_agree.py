@@ -25,7 +25,7 @@ def agree(folder, forms, nx, nu, angles, width, activation, skip, seed) -> set[s
     torch.manual_seed(seed)
     net = feature_net(nx, nu, min(angles, nx), width, activation, skip)
     function = to_casadi(net, name="policy", in_names=["x", "t"], out_names=["u"])
-    part = parity.Part("policy", function, net, {"x": (-3.0, 3.0), "t": (0.0, 5.0)}, net=net)
+    part = parity.ExportPart("policy", function, net, {"x": (-3.0, 3.0), "t": (0.0, 5.0)}, net=net)
     network = SimpleNamespace(export_parts=lambda: [part], system=SimpleNamespace(name="fuzz"))
     certificate = export(network, folder / "out", forms, against=forms)
     assert certificate.ok

@@ -15,7 +15,7 @@ from nocl.exports import bundle
 from nocl.exports.c_code import load, to_c
 from nocl.solvers import NMPC
 from nocl.solvers.ddp.without_compiler import NumpyKernel
-from nocl.solvers.nmpc.solver import _program
+from nocl.solvers.nmpc.solver import shared_program
 from nocl.support import compiler
 from nocl.translate.kernels import Kernel
 
@@ -86,7 +86,7 @@ def test_a_missing_compiler_is_missing_for_all(tmp_path, monkeypatch, cc, looked
                  lambda: NMPC(ocp, 7, compiled=tmp_path).solve([1.0, 0.0])):
         with pytest.raises(compiler.NoCompilerError, match=rf"no C compiler found \(looked for {looked}\): inst"):
             user()
-    assert looked in bundle._missing()["c"]
+    assert looked in bundle.missing_backends()["c"]
 
 
 @pytest.mark.parametrize(("cc", "message"), [("gcc 'open", "close its quotes"), ("FILE", "cannot be run")])
@@ -104,9 +104,9 @@ def test_ddp_does_without_what_cannot_be_run(monkeypatch, tmp_path):
     from nocl.solvers.ddp.solver import DDP
 
     monkeypatch.setenv("CC", "nosuchcc")
-    without_compiler._say_once.cache_clear()
+    without_compiler.say_once.cache_clear()
     with pytest.warns(UserWarning, match="looked for CC=nosuchcc"):
-        assert isinstance(DDP(nocl.load_ocp("pendulum"), intervals=4)._kernel, NumpyKernel)
+        assert isinstance(DDP(nocl.load_ocp("pendulum"), intervals=4).kernel, NumpyKernel)
 
 
 def damages(content: bytes) -> dict[str, bytes]:
@@ -127,7 +127,7 @@ def test_damaged_entries_are_built_again_and_never_loaded(tmp_path):
         caches.append(tmp_path / str(i))
         caches[-1].mkdir()
         (caches[-1] / whole.name).write_bytes(damaged)
-        assert compiler._whole(caches[-1], whole.name.rpartition("-")[0]) is None
+        assert compiler.whole_of(caches[-1], whole.name.rpartition("-")[0]) is None
     some = caches[::2]  # each is compiled again
     out, err = child(*some).communicate(timeout=300)
     assert out.split("\n")[:-1] == ["[41.0, 42.0, 43.0]"] * len(some), err
@@ -155,7 +155,7 @@ def test_a_damaged_program_of_nmpc_is_built_again(tmp_path):
     whole.rename(tmp_path / "aside")
     whole.write_bytes(content[:-9] + b"123456789")
     (tmp_path / "aside").unlink()
-    _program.cache_clear()  # as in another process
+    shared_program.cache_clear()  # as in another process
     assert NMPC(ocp, 9, starts=1, compiled=tmp_path).solve(x0).cost == first.cost
     assert [p.read_bytes() for p in tmp_path.iterdir()] == [content]
 
@@ -170,7 +170,7 @@ def test_a_kill_while_building_leaves_no_trace(tmp_path):
     builder.wait(timeout=300)
     assert left.is_dir()
     assert not (tmp_path / "cache").exists()
-    compiler._remove_left()
+    compiler.remove_left()
     assert not left.exists()
     assert living.is_dir()  # its process lives
     other.communicate(timeout=300)

@@ -13,7 +13,7 @@ import nocl
 from nocl.data import Solution
 from nocl.nets import MLP, FeatureNet
 from nocl.solvers import NMPC
-from nocl.solvers.ddp.solver import DDP, DDPSettings, _Work
+from nocl.solvers.ddp.solver import DDP, DDPSettings, Work
 from nocl.sysid.identification import LearnedDynamics
 from nocl.translate.rk4 import rk4_cost
 
@@ -289,7 +289,7 @@ def test_any_memory_layout_and_no_problem_at_all():
 def test_batches_and_threads_do_not_change_a_bit():
     ocp = problem("acrobot")
     one = solver("acrobot")
-    W = one._kernel.width
+    W = one.kernel.width
     x0 = ocp.initial_states.sample(3 * W + 2, 1)
     whole = one.solve(x0, curvature=True)
     two = DDP(ocp, threads=2).solve(x0, curvature=True)
@@ -348,9 +348,9 @@ def test_sweep_on_networks_equals_casadis_derivatives_of_the_step(name, activati
     s, n = ocp.system, ocp.system.nx
     u = np.random.default_rng(1).uniform(0.5 * s.lbu, 0.5 * s.ubu, (B, K, s.nu))
     d = DDP(ocp, intervals=K, dynamics=model, threads=1)
-    work = _Work(d, ocp.initial_states.sample(B, 0), np.zeros(B), u, None, None)
+    work = Work(d, ocp.initial_states.sample(B, 0), np.zeros(B), u, None, None)
     V, V_x, V_xx = np.zeros((B, K + 1)), np.zeros((B, K + 1, n)), np.zeros((B, K + 1, n, n))
-    work._backward(np.arange(B), V, V_x, V_xx)
+    work.backward(np.arange(B), V, V_x, V_xx)
     step, slopes, bend = step_functions(model.to_casadi(), ocp, ocp.horizon / K)
     newton = 0
     for b, k in np.ndindex(B, K):

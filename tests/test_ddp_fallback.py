@@ -17,7 +17,7 @@ FIELDS = ("cost", "x", "u", "gain", "V", "V_x", "V_xx", "success", "message", "i
 def both(name, K, n, dynamics=None, **guess):
     ocp = nocl.load_ocp(name)
     compiled, slow = (DDP(ocp, intervals=K, dynamics=dynamics, threads=1) for _ in range(2))
-    slow._kernel = NumpyKernel(ocp, dynamics)
+    slow.kernel = NumpyKernel(ocp, dynamics)
     x0, t0 = ocp.initial_states.sample(n, 3), np.linspace(0, ocp.horizon / 2, n)
     return [d.solve(x0, t0, curvature=True, **guess) for d in (compiled, slow)]
 
@@ -37,7 +37,7 @@ def test_numbers_are_the_compiled_ones(name, learned):
 @pytest.mark.parametrize("name", ["acrobot", "dubins", "quadrotor"])
 @pytest.mark.parametrize("mu", [0.0, 3.0])
 def test_one_sweep_and_one_rollout_equal_the_compiled_ones(name, mu):
-    from nocl.solvers.ddp.solver import _Work
+    from nocl.solvers.ddp.solver import Work
 
     ocp, K, B = nocl.load_ocp(name), 10, 5
     s, rng = ocp.system, np.random.default_rng(4)
@@ -47,13 +47,13 @@ def test_one_sweep_and_one_rollout_equal_the_compiled_ones(name, mu):
     for slow in (False, True):
         d = DDP(ocp, intervals=K, threads=1)
         if slow:
-            d._kernel = NumpyKernel(ocp)
-        work = _Work(d, ocp.initial_states.sample(B, 0), np.zeros(B), u, None, None)
+            d.kernel = NumpyKernel(ocp)
+        work = Work(d, ocp.initial_states.sample(B, 0), np.zeros(B), u, None, None)
         work.mu[:] = mu
         V, V_x, V_xx = np.zeros((B, K + 1)), np.zeros((B, K + 1, s.nx)), np.zeros((B, K + 1, s.nx, s.nx))
-        work._backward(np.arange(B), V, V_x, V_xx)
+        work.backward(np.arange(B), V, V_x, V_xx)
         work.alpha[:] = 0.25
-        work._rollout(np.arange(B), work.x, work.u, work.gain)
+        work.rollout(np.arange(B), work.x, work.u, work.gain)
         results.append([V, V_x, V_xx, work.k, work.gain, work.slope, work.curve, work.positive, work.new_x, work.new_J])
     sound = results[0][7] > 0
     assert np.array_equal(results[0][7], results[1][7])
@@ -64,12 +64,12 @@ def test_one_sweep_and_one_rollout_equal_the_compiled_ones(name, mu):
 
 def test_it_is_chosen_by_itself_and_said_once(monkeypatch):
     monkeypatch.setenv("CC", "no-such-cc")
-    without_compiler._say_once.cache_clear()
+    without_compiler.say_once.cache_clear()
     ocp = nocl.load_ocp("pendulum")
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         solvers = [DDP(ocp, intervals=10) for _ in range(2)]
-    assert all(isinstance(d._kernel, NumpyKernel) for d in solvers)
+    assert all(isinstance(d.kernel, NumpyKernel) for d in solvers)
     assert [str(w.message)[:19] for w in said] == ["no C compiler found"]
     solution = solvers[0].solve([[1.0, 0.0], [1e200, 0.0]])
     assert solution.success.tolist() == [True, False]

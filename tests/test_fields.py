@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from nocl.cli.commands import parser
-from nocl.cli.run_folder import Stages
+from nocl.cli.run_folder import RunFolder
 from nocl.solvers.cnd.settings import PaperSettings, TrainSettings
 from nocl.solvers.ddp.solver import DDPSettings
 from nocl.solvers.neural_oc import NeuralOCSettings
@@ -106,7 +106,7 @@ def test_a_run_of_before_is_taken_up(tmp_path):
         def __init__(self, made_from):
             self.card = {KEY: made_from}
 
-    now = Stages(nocl.load_ocp("pendulum"), tmp_path, 3)._made_from(exact=True)
+    now = RunFolder(nocl.load_ocp("pendulum"), tmp_path, 3)._made_from(exact=True)
     for quick, effort in ((False, "normal"), (True, "quick")):
         before = {k: v for k, v in now.items() if k != "effort"} | {"quick": quick}
         assert _ours(Saved(before), tmp_path).card[KEY] == now | {"effort": effort}

@@ -47,7 +47,7 @@ def run(kernel: Kernel, x: np.ndarray, n_out: int, threads: int = 1) -> np.ndarr
 
 def test_every_operation_equals_casadis_on_its_domain(tmp_path):
     # each operation gets two inputs of its own, so that each is tried on its own domain
-    ops = [(op, 1) for op in kernels._UNARY] + [(op, 2) for op in kernels._BINARY]
+    ops = [(op, 1) for op in kernels.C_UNARY] + [(op, 2) for op in kernels.C_BINARY]
     z = ca.SX.sym("z", 2, len(ops))
     rng = np.random.default_rng(0)
     outputs, columns = [], []
@@ -61,7 +61,7 @@ def test_every_operation_equals_casadis_on_its_domain(tmp_path):
         columns.append(column)
     f = ca.Function("f", [ca.vec(z)], [ca.vertcat(*outputs)])
     known = {step.op for step in instructions(f)}
-    assert set(kernels._UNARY) | set(kernels._BINARY) <= known | {"OP_ASSIGN"}
+    assert set(kernels.C_UNARY) | set(kernels.C_BINARY) <= known | {"OP_ASSIGN"}
     x = np.concatenate(columns, axis=1)
     got = run(Kernel(source(outputs, ca.vec(z)), tmp_path), x, len(ops))
     expected = f(x.T).full().T

@@ -15,10 +15,10 @@ from nocl.solvers import LQR
 from nocl.solvers.neural_oc import (
     NeuralOC,
     NeuralOCSettings,
+    Trainer,
     ValueNet,
-    _characteristics,
-    _minimiser,
-    _Trainer,
+    characteristics,
+    minimiser_of,
     train_neural_oc,
 )
 from nocl.systems import double_integrator, quadrotor
@@ -96,7 +96,7 @@ def test_the_quadrotors_minimiser_is_the_papers_closed_form():
     f9 = np.cos(theta) * np.cos(phi)
     u1 = 9.81 - (f7 * p[:, 6] + f8 * p[:, 7] + f9 * p[:, 8]) / (2 * 0.01)
     free = np.column_stack([u1, -p[:, 9:12] / (2 * 0.01)])
-    u = to_torch(_minimiser(ocp))(torch.from_numpy(x), torch.from_numpy(p)).numpy()
+    u = to_torch(minimiser_of(ocp))(torch.from_numpy(x), torch.from_numpy(p)).numpy()
     np.testing.assert_allclose(u, np.clip(free, -100, 100), rtol=1e-12, atol=1e-12)
     assert 0.1 < (np.abs(free) > 100).mean() < 0.9
 
@@ -106,7 +106,7 @@ def test_the_hjb_residual_is_zero_on_a_riccati_solution():
     s = double_integrator.system()
     ocp = nocl.OCP(s, horizon=2.0, running=ca.sumsqr(s.x) + 0.1 * ca.sumsqr(s.u), terminal=ca.sumsqr(s.x),
                    x_goal=[0, 0], u_goal=[0], initial_states=nocl.Gaussian(mean=[0.5, 0.0], std=[0.2, 0.2]))
-    trainer = _Trainer(ocp, NeuralOCSettings(**QUICK | {"steps": 40}), 0, torch.float64)
+    trainer = Trainer(ocp, NeuralOCSettings(**QUICK | {"steps": 40}), 0, torch.float64)
     net = trainer.net
     with torch.no_grad():
         for p in net.parameters():
@@ -128,7 +128,7 @@ def test_the_hjb_residual_is_zero_on_a_riccati_solution():
 
 def test_the_penalties_vanish_where_v_is_g_at_the_end():
     ocp = double_integrator.ocp()
-    trainer = _Trainer(ocp, NeuralOCSettings(**QUICK), 0, torch.float64)
+    trainer = Trainer(ocp, NeuralOCSettings(**QUICK), 0, torch.float64)
     with torch.no_grad():
         for p in trainer.net.parameters():
             p.zero_()
@@ -142,7 +142,7 @@ def test_the_penalties_vanish_where_v_is_g_at_the_end():
 
 @pytest.mark.parametrize("ocp", [quadrotor.ocp(), nocl.load_ocp("dubins")], ids=lambda ocp: ocp.system.name)
 def test_fused_is_torch(ocp):
-    function, n = _characteristics(ocp), 2 * ocp.system.nx
+    function, n = characteristics(ocp), 2 * ocp.system.nx
     z = [(0.3 * rows(n, 40)).requires_grad_() for _ in range(2)]
     y = [f(v) for f, v in zip((FusedFunction(function), to_torch(function)), z, strict=True)]
     torch.testing.assert_close(*y, rtol=1e-12, atol=1e-12)
@@ -152,7 +152,7 @@ def test_fused_is_torch(ocp):
 
 
 def test_the_gradient_of_the_loss_is_that_of_finite_differences():
-    trainer = _Trainer(quadrotor.ocp(horizon=0.5), NeuralOCSettings(**QUICK, weights=(0.1, 0.2, 0.3)), 0, torch.float64)
+    trainer = Trainer(quadrotor.ocp(horizon=0.5), NeuralOCSettings(**QUICK, weights=(0.1, 0.2, 0.3)), 0, torch.float64)
     x0 = trainer.states()
     trainer.loss(trainer.terms(x0)).backward()
     for name, i in (("w", 3), ("b", 0), ("A", (1, 2))):
@@ -174,8 +174,8 @@ def test_path_constraints_enter_as_the_problems_penalty():
     h = ocp.h(x.T).full()
     assert (h[:, 1] < 0).any(), "a state inside the obstacle"
     z = np.hstack([x, np.zeros((2, 3))])
-    L = _characteristics(ocp)(z.T).full()[3]
-    u = _minimiser(ocp)(x.T, np.zeros((3, 2))).full()
+    L = characteristics(ocp)(z.T).full()[3]
+    u = minimiser_of(ocp)(x.T, np.zeros((3, 2))).full()
     np.testing.assert_allclose(L, ocp.L_soft(x.T, u).full()[0], rtol=1e-13)
     assert L[1] > ocp.L(x.T, u).full()[0, 1] + 1
 
@@ -225,7 +225,7 @@ def test_the_same_seed_gives_the_same_controller(trained):
 
 
 def test_what_is_kept_is_the_best_on_held_out_states():
-    trainer = _Trainer(double_integrator.ocp(), NeuralOCSettings(**QUICK | {"iterations": 8}), 0)
+    trainer = Trainer(double_integrator.ocp(), NeuralOCSettings(**QUICK | {"iterations": 8}), 0)
     trainer.train(progress=False)
     trainer.net.load_state_dict(trainer.best)
     with torch.no_grad():

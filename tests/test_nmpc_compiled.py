@@ -6,7 +6,7 @@ import pytest
 
 import nocl
 from nocl.solvers import NMPC
-from nocl.solvers.nmpc.solver import _program
+from nocl.solvers.nmpc.solver import shared_program
 from nocl.solvers.nmpc.transcription import Transcription
 
 
@@ -39,7 +39,7 @@ def test_compiled_code_is_built_once_and_agrees(tmp_path, monkeypatch, solver):
     solution = fast.solve(x0, gains=True)
     assert [p.suffix for p in folder.iterdir()] == [".so"]
     assert len(built) == 1
-    _program.cache_clear()  # as in another process
+    shared_program.cache_clear()  # as in another process
     assert (NMPC(nocl.load_ocp("pendulum"), **options).solve(x0).u == solution.u).all()
     assert len(built) == 1
     plain = NMPC(ocp, 10, starts=2, solver=solver).solve(x0, gains=True)

@@ -21,13 +21,13 @@ from nocl.comparisons.report.animate import animate, so_far
 from nocl.comparisons.report.drawings import drawing, phase
 from nocl.comparisons.report.explain import worst
 from nocl.comparisons.report.findings import (
-    Loss,
     MethodAudit,
     Promise,
     Region,
     Robustness,
     Rollouts,
     Scenario,
+    ScenarioLoss,
     Stability,
     ValueAudit,
 )
@@ -79,7 +79,7 @@ def studied(mine):
     rollout = Rollouts("exact f, RK4", t, np.zeros((B, K, nx)), np.zeros((B, K - 1, 2)), np.ones(B))
     audit = MethodAudit("LQR", (rollout,), np.full(B, np.nan), rng.normal(size=B), value)
     yes = np.arange(B) > 0
-    losses = tuple(Loss(name, "continuous feedback", rng.uniform(1, 2, B), np.ones(B), yes, np.full(B, 0.1))
+    losses = tuple(ScenarioLoss(name, "continuous feedback", rng.uniform(1, 2, B), np.ones(B), yes, np.full(B, 0.1))
                    for name in ("LQR", "weak & mine"))
     robust = Robustness(mine.x0, (Scenario("kicks", "A kick at a random time.", losses),
                                   Scenario("mass + 20 %", "A heavier <sled>.", losses)), {})

@@ -13,7 +13,7 @@ import nocl
 from nocl import hjb
 from nocl.exports.casadi_forms import to_casadi
 from nocl.judge import simulate
-from nocl.solvers.cnd.paper import PaperSettings, _side_by_side, _Trainer, controller_net, train_paper, value_net
+from nocl.solvers.cnd.paper import PaperSettings, Trainer, controller_net, side_by_side, train_paper, value_net
 from nocl.systems import cartpole, double_integrator, dubins, quadrotor
 from nocl.translate.fused import FusedStep
 from nocl.translate.rk4 import rk4_cost
@@ -145,14 +145,14 @@ def test_the_public_call_keeps_checkpoints(tmp_path):
 def test_every_tensor_follows_the_device(device, options):
     """One loss and its gradient on another device than the CPU; on "meta" a tensor left behind raises."""
     ocp = double_integrator.ocp()
-    trainer = _Trainer(ocp, None, PaperSettings(**TINY, **options), 0, False, device, torch.float32)
+    trainer = Trainer(ocp, None, PaperSettings(**TINY, **options), 0, False, device, torch.float32)
     policy, value = trainer.starts[0], trainer.value
     terms = trainer.losses(policy, value)
     parameters = [*policy.parameters(), *value.parameters()]
     gradients = torch.autograd.grad(terms.total(trainer.settings.weights), parameters, materialize_grads=True)
     assert {g.device.type for g in gradients} == {device}
     assert trainer.step is rk4_cost  # compiled steps are the CPU's
-    many, _ = _side_by_side(trainer.starts)
+    many, _ = side_by_side(trainer.starts)
     assert trainer.costs(many, trainer.states(2, 3), hold=True).device.type == device
 
 

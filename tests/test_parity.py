@@ -74,7 +74,7 @@ class Off:
     def __init__(self, shift: float, only: str) -> None:
         self.shift, self.only, self.ocp = shift, only, CONTROLLER.ocp
 
-    def export_parts(self) -> list[parity.Part]:
+    def export_parts(self) -> list[parity.ExportPart]:
         return [dataclasses.replace(p, torch=lambda x, t, p=p: p.torch(x, t) + self.shift * x[:, :1] ** 2)
                 if p.name == self.only else p for p in CONTROLLER.export_parts()]
 

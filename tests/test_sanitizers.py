@@ -29,7 +29,7 @@ if kind == "looped":
     kernel.STRAIGHT = 0
 d = DDP(ocp, intervals=7, dynamics=random_model(name) if kind == "learned" else None, threads=2, cache=cache,
         settings=DDPSettings(max_iterations=4))
-W = d._kernel.width
+W = d.kernel.width
 for n in (1, W, 2 * W + 1):
     x0 = ocp.initial_states.sample(n, 0)
     x0[n // 2] *= 1e30  # one that blows up, far from where sines are polynomials

@@ -9,7 +9,7 @@ import torch
 from nocl.sysid.from_log import initial
 from nocl.sysid.labels import box_of
 from nocl.sysid.logs.log import Log
-from nocl.sysid.logs.shooting import Stage, Windows, _Problem, lengths
+from nocl.sysid.logs.shooting import WindowFit, WindowProblem, Windows, lengths
 from nocl.sysid.networks import assemble
 from nocl.sysid.settings import LogSettings
 from nocl.sysid.stated import Stated
@@ -18,7 +18,7 @@ from nocl.systems import pendulum
 SMALL = LogSettings(width=3, window=4)
 
 
-def problem(substeps: int = 1, ridge: float = 0.0, n: int = 12) -> _Problem:
+def problem(substeps: int = 1, ridge: float = 0.0, n: int = 12) -> WindowProblem:
     """A small random network on a short log with a hole and a window that is cut off."""
     system, rng = pendulum.system(), np.random.default_rng(0)
     x = np.column_stack([np.sin(0.3 * np.arange(n)), np.cos(0.3 * np.arange(n))]) + 0.1 * rng.standard_normal((n, 2))
@@ -30,10 +30,10 @@ def problem(substeps: int = 1, ridge: float = 0.0, n: int = 12) -> _Problem:
     net = assemble(parts, weights, True)
     unit = torch.from_numpy(rng.uniform(0.5, 2.0, sum(p.numel() for p in net.parameters())))
     windows = Windows.of(log, [r.smooth.x for r in log], 4, 100, rng)
-    return _Problem(net, unit, windows, substeps, ridge)
+    return WindowProblem(net, unit, windows, substeps, ridge)
 
 
-def theta_of(p: _Problem) -> torch.Tensor:
+def theta_of(p: WindowProblem) -> torch.Tensor:
     return torch.nn.utils.parameters_to_vector(p.net.parameters()).detach() / p.unit
 
 
@@ -95,9 +95,9 @@ def test_no_step_is_a_failure_unless_the_noise_is_reached():
     stage = p.minimise(theta_of(p), 0, 1e-4, lambda _: None)[2]
     assert stage.first > 1
     assert stage.failed
-    assert not Stage(4, 0.9, 0.9, 0).failed
-    assert Stage(2, math.inf, math.inf, 0).failed
-    assert Stage(2, math.nan, math.nan, 0).failed
+    assert not WindowFit(4, 0.9, 0.9, 0).failed
+    assert WindowFit(2, math.inf, math.inf, 0).failed
+    assert WindowFit(2, math.nan, math.nan, 0).failed
 
 
 def test_windows_grow_to_the_longest_run():

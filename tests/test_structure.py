@@ -6,12 +6,12 @@ import pytest
 
 import nocl
 from nocl.data import Dataset
-from nocl.sysid.structure import Box, Expansion, evaluate, find, plain, read
+from nocl.sysid.structure import Expansion, Variables, evaluate, find, plain, read
 from nocl.systems import acrobot, cartpole, dubins, quadrotor, van_der_pol
 
 
-def box_of(system: nocl.System) -> Box:
-    return Box(system.names, np.r_[system.lbx, system.lbu], np.r_[system.ubx, system.ubu], system.nx,
+def box_of(system: nocl.System) -> Variables:
+    return Variables(system.names, np.r_[system.lbx, system.lbu], np.r_[system.ubx, system.ubu], system.nx,
                system.angle_indices)
 
 
@@ -145,7 +145,7 @@ def test_gradient_labels_of_coefficients_match_finite_differences():
 
 
 def test_expansion_interpolates_a_product_of_a_quadratic_and_sines():
-    box = Box(("a", "w"), np.array([-5.0, -6.0]), np.array([5.0, 6.0]), 2, (0,))
+    box = Variables(("a", "w"), np.array([-5.0, -6.0]), np.array([5.0, 6.0]), 2, (0,))
     expansion = Expansion(box, (0,), (0, 1), (1, 2))
 
     def labels(z):

@@ -15,7 +15,7 @@ from nocl.comparisons.disturbances import Disturbances, mass_variants, on_plant,
 from nocl.comparisons.promise import interval, lower_bound, promises
 from nocl.comparisons.reference import Reference, resolved
 from nocl.comparisons.region import grown, region
-from nocl.comparisons.report.findings import Loss, quantiles
+from nocl.comparisons.report.findings import ScenarioLoss, quantiles
 from nocl.comparisons.report.tables import tables
 from nocl.comparisons.stability import local, stability
 from nocl.solvers import LQR, NMPC
@@ -319,8 +319,8 @@ def test_a_fingerprint_of_a_function_does_not_change_with_its_use():
 
 
 def test_losses_of_failures_and_of_unknown_optima():
-    loss = Loss("m", "how", np.array([1.1, np.inf, 1.0]), np.array([1.0, 1.0, np.inf]), np.array([True, False, True]),
-                np.zeros(3))
+    loss = ScenarioLoss("m", "how", np.array([1.1, np.inf, 1.0]), np.array([1.0, 1.0, np.inf]),
+                        np.array([True, False, True]), np.zeros(3))
     np.testing.assert_allclose(loss.lost, [10, np.inf, np.nan])
     assert quantiles(loss.lost)["p95"] == np.inf
     assert quantiles(np.array([np.nan])) == {}

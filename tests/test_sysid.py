@@ -14,7 +14,7 @@ from nocl.data import Dataset
 from nocl.sysid import fitting
 from nocl.sysid.identification import LearnedDynamics, PaperSettings, Settings, identify
 from nocl.sysid.labels import Source
-from nocl.sysid.networks import LEAST, NARROWEST, PROBES, SHARE, Draws, _widest, frequencies, weights_of
+from nocl.sysid.networks import LEAST, NARROWEST, PROBES, SHARE, Draws, frequencies, weights_of, widest_net
 from nocl.sysid.structure import plain
 from nocl.systems import acrobot, cartpole, dubins, pendulum, quadrotor
 
@@ -177,7 +177,7 @@ def test_the_widest_network_has_half_as_many_weights_as_labels(features, outputs
     def weights(h):
         return h * (features + 1) + h * (h + 1) + outputs * (h + 1 + features)
 
-    h = _widest(features, outputs, rows * outputs)
+    h = widest_net(features, outputs, rows * outputs)
     assert h == NARROWEST or weights(h) <= rows * outputs / 2
     assert weights(h + 1) > rows * outputs / 2
 

@@ -13,10 +13,10 @@ from nocl.sysid import fitting
 from nocl.sysid.affine import affine_in_controls
 from nocl.sysid.identification import LearnedDynamics, Settings, identify
 from nocl.sysid.labels import Source, box_of, draw_pool, find_structure
-from nocl.sysid.networks import _samples
+from nocl.sysid.networks import samples_of
 from nocl.sysid.progress import Progress
 from nocl.sysid.stated import Stated
-from nocl.sysid.structure import Box, read
+from nocl.sysid.structure import Variables, read
 from nocl.sysid.trial import better_affine
 from nocl.systems import cartpole
 
@@ -111,7 +111,7 @@ def test_exact_coefficients_meet_the_labels(known):
     exact, slope = parts.residual(oracle, pool.z)
     assert parts.groups
     for i, group in enumerate(parts.groups):
-        samples, mean, spread = _samples(parts, pool, i, True)
+        samples, mean, spread = samples_of(parts, pool, i, True)
         variables = [*group.variables, *parts.controls(group)]
         unit = parts.split.box.width[variables] / np.sqrt(12)
         c = list(group.coefficients)
@@ -241,7 +241,7 @@ def test_controls_are_taken_out_where_that_leaves_something():
     assert [g.variables for g in changed.groups] == [(2, 3)]
     assert len(changed.groups[0].coefficients) == 2 * len(found.groups[0].coefficients)
     assert affine_in_controls(changed) is None
-    box = Box(("x", "u"), np.array([-1.0, -1.0]), np.array([1.0, 1.0]), 1)
+    box = Variables(("x", "u"), np.array([-1.0, -1.0]), np.array([1.0, 1.0]), 1)
     z = np.random.default_rng(0).uniform(-1, 1, (200, 2))
     alone = read(z, np.exp(np.sin(3 * z[:, 1:])), np.stack([0 * z[:, :1], 3 * np.cos(3 * z[:, 1:])
                                                             * np.exp(np.sin(3 * z[:, 1:]))], 2), box)

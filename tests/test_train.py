@@ -246,7 +246,7 @@ def test_value_scores_are_zero_for_the_exact_value():
 @pytest.mark.parametrize("stage", ["_regress", "_value"])
 def test_interrupted_and_resumed_is_the_same_run(stage, whole, tmp_path, monkeypatch):
     ocp = whole.ocp
-    original = getattr(module._Training, stage)
+    original = getattr(module.Training, stage)
 
     def interrupted(self, *args):
         if self.round >= 2:
@@ -254,11 +254,11 @@ def test_interrupted_and_resumed_is_the_same_run(stage, whole, tmp_path, monkeyp
         return original(self, *args)
 
     with monkeypatch.context() as patch:
-        patch.setattr(module._Training, stage, interrupted)
+        patch.setattr(module.Training, stage, interrupted)
         with pytest.raises(KeyboardInterrupt):
             nocl.train(ocp, settings=TINY, seed=1, out=tmp_path, progress=False)
     assert [p.name for p in tmp_path.iterdir()] == [module.CHECKPOINT]
-    monkeypatch.setattr(module._Training, "_first_labels", lambda self: pytest.fail("labels were made again"))
+    monkeypatch.setattr(module.Training, "_first_labels", lambda self: pytest.fail("labels were made again"))
     resumed = nocl.train(ocp, settings=TINY, seed=1, out=tmp_path, progress=False)
     x = ocp.initial_states.sample(8, 1)
     assert np.array_equal(resumed(x, 0.4), whole(x, 0.4))

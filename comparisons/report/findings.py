@@ -106,7 +106,7 @@ class MethodAudit:
 
 
 @dataclass(frozen=True, eq=False)
-class Loss:
+class ScenarioLoss:
     """One method in one scenario, on all its B states."""
 
     method: str
@@ -135,7 +135,7 @@ class Scenario:
 
     name: str  # like "kicks"
     text: str  # what was done, in a sentence
-    losses: tuple[Loss, ...]
+    losses: tuple[ScenarioLoss, ...]
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,7 +34,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
-class Plan:
+class Planned:
     """A solver's own trajectory and costate, at the K+1 nodes of its run; NaN where it has none."""
 
     x: Array  # [B, K+1, nx]
@@ -53,7 +53,7 @@ class Judged:
     evaluations: Array  # [B], of f with its derivatives, by which the controls were computed; NaN where unknown
     solves: Array  # [B], solves that `ms_first` went into: several starts, neighbours; 1 for a controller
     predicted: Array  # [B], the cost that the method itself expected, NaN where it has no opinion
-    plan: Plan | None = None  # what a solver planned
+    plan: Planned | None = None  # what a solver planned
     value: Callable[[Array, float], Array] | None = None  # (x [B, nx], t) -> V [B], where it has one
     held: bool = False  # whether each control is held to the next node; else it is continuous
 

@@ -155,7 +155,7 @@ class Way:
 WAYS = {"level-sets": Way("HJB level sets", _level_sets), "nmpc": Way("NMPC", _nmpc), "cnd": Way("CND", _cnd)}
 
 
-class Approaches(table.Table[Plan, Cell, Cell]):
+class Approaches(table.PaperTable[Plan, Cell, Cell]):
     """A row for each cell, by rising numbers of states."""
 
     name, title, known = "approaches", "approaches", "the table of approaches"

@@ -15,10 +15,10 @@ from nocl.comparisons.reproduce import table
 from nocl.comparisons.reproduce.controllers import (
     GYM,
     QUADROTOR,
+    Assignment,
     Cell,
     Plan,
     Published,
-    Task,
     Way,
     identified,
     judged,
@@ -90,7 +90,7 @@ def _over(parts: Sequence[Array]) -> tuple[float, float, float, float]:
     return float(values.mean()), float(values.std()), min(means), max(means)
 
 
-class Control(table.Table[Plan, Cell, Entry]):
+class Control(table.PaperTable[Plan, Cell, Entry]):
     """One of the tables of control."""
 
     known, plan_type, cell_type = "the tables of control", Plan, Cell
@@ -131,7 +131,7 @@ class Control(table.Table[Plan, Cell, Entry]):
         start = time.perf_counter()
         model = identified(ocp, place.seed, plan) if way.learned and not ready else None
         identify = 0.0 if model is None else time.perf_counter() - start
-        start, cpu, task = time.perf_counter(), time.process_time(), Task(ocp, model, place.seed, plan)
+        start, cpu, task = time.perf_counter(), time.process_time(), Assignment(ocp, model, place.seed, plan)
         made = shipped(task, way.learned) if ready else way.make(task)
         seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
         if made.seconds is not None:

@@ -82,7 +82,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Task:
+class Assignment:
     """What a way is given."""
 
     ocp: OCP
@@ -116,7 +116,7 @@ class Way:
     """A row of a table."""
 
     title: str
-    make: Callable[[Task], Made] | None  # None: not run yet
+    make: Callable[[Assignment], Made] | None  # None: not run yet
     learned: bool = False  # whether it has f_theta only
     paper: dict[str, Published] = field(default_factory=dict)  # by problem
     most: int | None = None  # initial states at most, where each takes long
@@ -162,7 +162,7 @@ def _paper_budgets(problem: str, plan: Plan) -> dict[str, Any]:
     return {name: list(value) if isinstance(value, tuple) else value for name, value in settings.items()}
 
 
-def _paper(task: Task) -> Made:
+def _paper(task: Assignment) -> Made:
     settings = paper_settings(task.ocp.system.name, task.plan)
     cnd = train(task.ocp, task.model, method="paper", seed=task.seed, settings=settings, progress=False)
     text = f"u(x), {settings.iterations} iterations of {settings.batch} rollouts, Adam from {settings.learning_rate:g}"
@@ -170,7 +170,7 @@ def _paper(task: Task) -> Made:
     return Made(cnd, text, cnd.card["dynamics_evaluations"])
 
 
-def _default(task: Task) -> Made:
+def _default(task: Assignment) -> Made:
     quick = TrainSettings(seeds=6, starts=6, states=40, tails=200, visits=100, rounds=1, iterations=200,
                           value=False, held_out=8)
     settings = quick if task.plan.quick else None
@@ -179,14 +179,14 @@ def _default(task: Task) -> Made:
     return Made(cnd, rounds, cnd.card["dynamics_evaluations"])
 
 
-def shipped(task: Task, learned: bool) -> Made:
+def shipped(task: Assignment, learned: bool) -> Made:
     """nocl's default as it comes with nocl, made by the same call with seed 0."""
     card = (cnd := pretrained(task.ocp.system.name, "learned" if learned else "exact")).card
     return Made(cnd, "u(x, t) and V, as it ships with nocl", card.get("dynamics_evaluations", math.nan),
                 float(card["seconds"]))
 
 
-def _no_control_cost(make: Callable[[Task], Made], task: Task) -> Made:
+def _no_control_cost(make: Callable[[Assignment], Made], task: Assignment) -> Made:
     """The quadrotor's problem with R = 0; where a method refuses that, it says why."""
     try:
         return make(replace(task, ocp=quadrotor.ocp(R=0.0)))
@@ -194,12 +194,12 @@ def _no_control_cost(make: Callable[[Task], Made], task: Task) -> Made:
         return Made(None, f"refused: {error}")
 
 
-def _nmpc(task: Task) -> Made:
+def _nmpc(task: Assignment) -> Made:
     return Made(NMPC(task.ocp, INTERVALS, dynamics=task.model, seed=task.seed).controller(),
                 f"closed loop, {INTERVALS} intervals, solved again at each")
 
 
-def _lqr(task: Task) -> Made:
+def _lqr(task: Assignment) -> Made:
     return Made(LQR(task.ocp), "finite horizon, about the goal, clipped to U")
 
 
@@ -207,7 +207,7 @@ def _oc_budgets(problem: str, plan: Plan) -> dict[str, Any]:
     return {"iterations": plan.oc_iterations, "batch": plan.oc_batch}
 
 
-def _neural_oc(task: Task) -> Made:
+def _neural_oc(task: Assignment) -> Made:
     n = task.plan.oc_iterations
     settings = NeuralOCSettings(iterations=n, batch=task.plan.oc_batch, drop_every=math.ceil(n / OC_DROPS))
     if task.plan.quick:

@@ -243,7 +243,7 @@ def _entry(cells: Sequence[Cell], best: dict[int, Cell]) -> Entry:
                  len(cells), cells[0].made)
 
 
-class Dubins(table.Table[Plan, Cell, Entry]):
+class Dubins(table.PaperTable[Plan, Cell, Entry]):
     """One problem, a row a way."""
 
     name, title, known, file = "dubins", "Dubins", "the Dubins table", "dubins-{way}-{seed}"

@@ -156,7 +156,7 @@ def _dearest(cells: Sequence[Cell]) -> list[Cell]:
     return [c for c in cells if c.settings == most]
 
 
-class TableOne(table.Table[Plan, Cell, Entry]):
+class TableOne(table.PaperTable[Plan, Cell, Entry]):
     """Ways down, systems across."""
 
     name, title, known, file = "sysid", "Table I", "Table I", "{problem}-{way}-{seed}"

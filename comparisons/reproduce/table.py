@@ -69,7 +69,7 @@ E = TypeVar("E")
 Column = tuple[str, Callable[[E], str]]  # its head, and a row's text
 
 
-class Table(ABC, Generic[P, C, E]):
+class PaperTable(ABC, Generic[P, C, E]):
     """A table of the paper. P is its plan, C its cells, E its rows."""
 
     name: str  # at the command line, and of its files

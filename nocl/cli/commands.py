@@ -170,10 +170,10 @@ def _problem(args: argparse.Namespace) -> tuple[OCP, Path]:
 
 
 def _run(args: argparse.Namespace) -> None:
-    from nocl.cli.run_folder import Stages  # torch
+    from nocl.cli.run_folder import RunFolder  # torch
 
     ocp, out = _problem(args)
-    stages = Stages(ocp, out, args.seed, args.effort)
+    stages = RunFolder(ocp, out, args.seed, args.effort)
     stages.check(exact=args.exact)
     _refuse(ocp, args.methods, registry.Options(args.intervals, args.seed))
     with alone(out):
@@ -195,10 +195,10 @@ def _told(stage: Callable[[], None]) -> ValueError | None:
 
 
 def _identify(args: argparse.Namespace) -> None:
-    from nocl.cli.run_folder import Stages  # torch
+    from nocl.cli.run_folder import RunFolder  # torch
 
     ocp, out = _problem(args)
-    stages = Stages(ocp, out, args.seed, args.effort)
+    stages = RunFolder(ocp, out, args.seed, args.effort)
     stages.check(exact=False)
     if args.data is None and (args.known or args.control_affine or args.hold_controls):
         raise ValueError("--known, --control-affine and --hold-controls are for logs: name one by --data")
@@ -210,10 +210,10 @@ def _identify(args: argparse.Namespace) -> None:
 
 
 def _train(args: argparse.Namespace) -> None:
-    from nocl.cli.run_folder import Stages  # torch
+    from nocl.cli.run_folder import RunFolder  # torch
 
     ocp, out = _problem(args)
-    stages = Stages(ocp, out, args.seed, args.effort)
+    stages = RunFolder(ocp, out, args.seed, args.effort)
     stages.check(exact=args.exact)
     with alone(out):
         stages.train(exact=args.exact)
@@ -228,17 +228,17 @@ def _solve(args: argparse.Namespace) -> None:
 
 
 def _export(args: argparse.Namespace) -> None:
-    from nocl.cli.run_folder import Stages, load_run  # torch
+    from nocl.cli.run_folder import RunFolder, load_run  # torch
 
     run = args.run
     cnd = load_run(run)
     out = args.out if args.out is not None else run / "export"
     arguments.check_out(out)
-    Stages(cnd.ocp, run, 0).export(cnd, out, tuple(dict.fromkeys(args.to or ("casadi", "c"))), args.against)
+    RunFolder(cnd.ocp, run, 0).export(cnd, out, tuple(dict.fromkeys(args.to or ("casadi", "c"))), args.against)
 
 
 def _compare(args: argparse.Namespace) -> None:
-    from nocl.cli.run_folder import Stages, load_run  # torch
+    from nocl.cli.run_folder import RunFolder, load_run  # torch
 
     run = args.run
     cnd = load_run(run)
@@ -247,7 +247,7 @@ def _compare(args: argparse.Namespace) -> None:
     seed = int(cnd.card.get("seed", 0)) if args.seed is None else args.seed
     _refuse(cnd.ocp, args.methods, registry.Options(args.intervals, seed))
     with alone(run):  # where outcomes so far are kept
-        Stages(cnd.ocp, run, seed).compare(cnd, out, args.methods, args.n, args.intervals, args.hold, args.robust)
+        RunFolder(cnd.ocp, run, seed).compare(cnd, out, args.methods, args.n, args.intervals, args.hold, args.robust)
 
 
 def _refuse(ocp: OCP, methods: Sequence[str], options: registry.Options) -> None:

@@ -22,7 +22,7 @@ FLAGS: dict[str, tuple[Any, str | None, str]] = {
 
 
 @dataclass(frozen=True)
-class Table:
+class TableCommand:
     """A table at the command line: where it is defined, as "module:NAME", and its flags in words."""
 
     made_by: str
@@ -35,25 +35,27 @@ CONTROL = {"--seeds": "of controllers, learned dynamics and initial states; defa
            "--n": "default: 1000, with --quick 8", "--iterations": "default: 1000, with --quick 10",
            "--ways": "cnd,nmpc; default: all that can be run"}
 TABLES = {
-    "sysid": Table("nocl.comparisons.reproduce.sysid:TABLE",
-                   "Table I: the error of learned dynamics by activation and supervision",
-                   {"--seeds": "networks a cell; default: 3, with --quick 1",
-                    "--iterations": "default: 50000, with --quick 1000", "--problems": "systems; default: all four",
-                    "--ways": "sine-gradients,nocl; default: all nine"}),
-    "dubins": Table("nocl.comparisons.reproduce.dubins:TABLE",
-                    "a car round an obstacle: RRT*, NMPC, level sets, CND, the optimum",
-                    {"--seeds": "sets of initial states; default: 1", "--n": "default: 1000, with --quick 20",
-                     "--iterations": "default: 1000, with --quick 20", "--grid": "default: 41,81,81",
-                     "--ways": "rrt-100,cnd; default: all eight"}),
-    "gym": Table("nocl.comparisons.reproduce.control:GYM_TABLE", "acrobot and cart-pole by learned dynamics: CND, NMPC",
-                 {**CONTROL, "--problems": "acrobot, cartpole; default: both"}, shipped=True),
-    "quadrotor": Table("nocl.comparisons.reproduce.control:QUADROTOR_TABLE",
-                       "the quadrotor, f known and not: CND, NeuralOC, NMPC, LQR",
-                       {**CONTROL, "--oc-iterations": "default: 6000 as published, with --quick 20",
-                        "--oc-batch": "default: 1024 as published, with --quick 16"}, shipped=True),
-    "approaches": Table("nocl.comparisons.reproduce.approaches:TABLE",
-                        "which approach gives what: time and memory by number of states",
-                        {"--problems": "default: six, of 2 to 12 states"})}
+    "sysid": TableCommand("nocl.comparisons.reproduce.sysid:TABLE",
+                          "Table I: the error of learned dynamics by activation and supervision",
+                          {"--seeds": "networks a cell; default: 3, with --quick 1",
+                           "--iterations": "default: 50000, with --quick 1000",
+                           "--problems": "systems; default: all four",
+                           "--ways": "sine-gradients,nocl; default: all nine"}),
+    "dubins": TableCommand("nocl.comparisons.reproduce.dubins:TABLE",
+                           "a car round an obstacle: RRT*, NMPC, level sets, CND, the optimum",
+                           {"--seeds": "sets of initial states; default: 1", "--n": "default: 1000, with --quick 20",
+                            "--iterations": "default: 1000, with --quick 20", "--grid": "default: 41,81,81",
+                            "--ways": "rrt-100,cnd; default: all eight"}),
+    "gym": TableCommand("nocl.comparisons.reproduce.control:GYM_TABLE",
+                        "acrobot and cart-pole by learned dynamics: CND, NMPC",
+                        {**CONTROL, "--problems": "acrobot, cartpole; default: both"}, shipped=True),
+    "quadrotor": TableCommand("nocl.comparisons.reproduce.control:QUADROTOR_TABLE",
+                              "the quadrotor, f known and not: CND, NeuralOC, NMPC, LQR",
+                              {**CONTROL, "--oc-iterations": "default: 6000 as published, with --quick 20",
+                               "--oc-batch": "default: 1024 as published, with --quick 16"}, shipped=True),
+    "approaches": TableCommand("nocl.comparisons.reproduce.approaches:TABLE",
+                               "which approach gives what: time and memory by number of states",
+                               {"--problems": "default: six, of 2 to 12 states"})}
 ALIASES = {"sysid": {"--problems": "--systems"}}  # other names of flags
 
 
@@ -78,7 +80,7 @@ def add_tables(sub: argparse.ArgumentParser) -> None:
 
 
 def table_of(name: str) -> Any:
-    """The table itself, a nocl.comparisons.reproduce.table.Table."""
+    """The table itself, a nocl.comparisons.reproduce.table.PaperTable."""
     module, _, variable = TABLES[name].made_by.partition(":")
     return getattr(import_module(module), variable)
 

@@ -42,7 +42,7 @@ OF_LOGS = ("data", "known", "control_affine", "hold_controls")  # of that, what 
 
 
 @dataclass(frozen=True)
-class Stages:
+class RunFolder:
     """The stages of one problem in one folder; what was made with other settings there is made anew, and said so."""
 
     ocp: OCP

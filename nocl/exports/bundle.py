@@ -18,7 +18,7 @@ from nocl.exports.c_code import load
 from nocl.exports.casadi_forms import to_casadi
 from nocl.exports.onnx_reader import from_onnx
 from nocl.exports.onnx_writer import Session, to_onnx
-from nocl.exports.parity import Certificate, Finding, Part
+from nocl.exports.parity import Certificate, ExportPart, Finding
 from nocl.support import compiler, store
 from nocl.support.checks import Array
 from nocl.system import System
@@ -28,7 +28,7 @@ PROOF = "parity.json"
 NEEDS = {"l4casadi": ("l4casadi",), "onnx": ("onnx", "onnxruntime")}  # packages
 
 
-def parts_of(thing: Any) -> list[Part]:
+def parts_of(thing: Any) -> list[ExportPart]:
     """The functions of a controller or of learned dynamics (objects with `export_parts()`), or of a list of these.
 
     Raises ValueError for others, and for a list with two functions of one name or of different systems.
@@ -41,7 +41,7 @@ def parts_of(thing: Any) -> list[Part]:
                              "different ones of one system: export the others to another folder")
         return parts
     if hasattr(thing, "export_parts"):
-        made: list[Part] = thing.export_parts()
+        made: list[ExportPart] = thing.export_parts()
         return made
     raise ValueError(f"export: got a {type(thing).__name__}; expected a CND, LearnedDynamics or a list of them")
 
@@ -68,7 +68,7 @@ def export(thing: Any, folder: str | os.PathLike[str], to: Sequence[str] = ("cas
     for form in (*to, *(against or ())):
         if form not in FORMS:
             raise ValueError(f"export: the form is {form!r}; expected some of {', '.join(FORMS)}")
-    missing = _missing()
+    missing = missing_backends()
     for form in to:
         if form in missing:
             raise ValueError(f"export: to={form!r} needs {missing[form]}")
@@ -100,7 +100,7 @@ def _title(thing: Any) -> tuple[str, str]:
     return _system(things[0]).name, "; ".join(repr(one).split("\n")[0] for one in things)
 
 
-def _missing() -> dict[str, str]:
+def missing_backends() -> dict[str, str]:
     """The forms that cannot be made here, with what they need."""
     missing = {form: f"the package(s) {', '.join(absent)}: pip install \"nocl[{form}]\"" for form, packages in
                NEEDS.items() if (absent := [p for p in packages if find_spec(p) is None])}
@@ -134,7 +134,7 @@ def _merge(new: Path, folder: Path) -> None:
 class _Export:
     """Files in `new`, or in `scratch` if only compared; what L4CasADi builds must stand where it stays, in `lib`."""
 
-    def __init__(self, parts: list[Part], new: Path, lib: Path, scratch: Path, title: tuple[str, str]) -> None:
+    def __init__(self, parts: list[ExportPart], new: Path, lib: Path, scratch: Path, title: tuple[str, str]) -> None:
         self.parts, self.new, self.lib, self.scratch, self.title = parts, new, lib, scratch, title
         self.findings: list[Finding] = []
         self.z = {part.name: parity.samples(part) for part in parts}
@@ -149,7 +149,7 @@ class _Export:
         points = min(len(z) for z in self.z.values())
         return Certificate(self.findings, points, left_out)
 
-    def _compare(self, part: Part, backend: str, dtype: str, values: parity.Rows,
+    def _compare(self, part: ExportPart, backend: str, dtype: str, values: parity.Rows,
                  slopes: parity.Rows | None = None) -> None:
         found = parity.findings(part, backend, dtype, self.z[part.name], values, slopes, self.expected[part.name])
         for finding in found:
@@ -191,7 +191,7 @@ class _Export:
             for part in self.parts:
                 self._by_c(part, folder, dtype)
 
-    def _by_c(self, part: Part, folder: Path, dtype: str) -> None:
+    def _by_c(self, part: ExportPart, folder: Path, dtype: str) -> None:
         """A function's C against its values; networks also get the C of their Jacobian, in passing."""
         prefix, note = self.title
         compiled = load(part.to_c(folder, prefix, dtype=dtype, note=note), f"{prefix}_{part.name}")
@@ -207,17 +207,17 @@ class _Export:
         self._compare(part, "C", dtype, _split(compiled, part), slopes)
 
 
-def _split(function: Any, part: Part) -> parity.Rows:
+def _split(function: Any, part: ExportPart) -> parity.Rows:
     """A function of several arguments as one of rows."""
     ends = np.cumsum(part.sizes)[:-1]
     return lambda z: function(*np.split(z, ends, axis=1))
 
 
-def _jacobian(part: Part) -> Part:
-    """All first derivatives, row by row, as a Part."""
+def _jacobian(part: ExportPart) -> ExportPart:
+    """All first derivatives, row by row, as an ExportPart."""
     f = part.column
     args = f.mx_in()
     J = ca.horzcat(*(ca.jacobian(f(*args), a) for a in args))
     bounds = {name: part.bounds[name] for name in f.name_in()}
     column = ca.Function(part.name, args, [ca.vec(ca.densify(J).T)], f.name_in(), ["J"])
-    return Part(part.name, column, part.torch, bounds)
+    return ExportPart(part.name, column, part.torch, bounds)

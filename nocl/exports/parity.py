@@ -28,7 +28,7 @@ Rows = Callable[[Array], Array]  # z [N, n] -> values [N, m] or derivatives [N, 
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class ExportPart:
     """One function that is exported, and what it has to equal."""
 
     name: str
@@ -110,7 +110,7 @@ class Certificate:
                 "limits": LIMITS, "findings": rows}
 
 
-def samples(part: Part, n: int = 192, corners: int = 64, seed: int = 0) -> Array:
+def samples(part: ExportPart, n: int = 192, corners: int = 64, seed: int = 0) -> Array:
     """Corners of the part's box (all, where they are few) and n uniform points in it, [N, inputs]."""
     boxes = [[np.broadcast_to(b, size) for b in part.bounds[name]]
              for name, size in zip(part.casadi.name_in(), part.sizes, strict=True)]
@@ -125,7 +125,7 @@ def samples(part: Part, n: int = 192, corners: int = 64, seed: int = 0) -> Array
 Reference = tuple[Array, Array, Array]  # values [N, m], first derivatives [N, m, n], how they change [N, m, n]
 
 
-def reference_of(part: Part, z: Array) -> Reference:
+def reference_of(part: ExportPart, z: Array) -> Reference:
     """Values and derivatives by torch in float64, and what changes of z, relative to the box, make of the latter."""
     y, J = of_torch(part, z)
     signs = np.random.default_rng(1).choice([-1.0, 1.0], (TRIALS, z.shape[1]))
@@ -135,7 +135,7 @@ def reference_of(part: Part, z: Array) -> Reference:
     return y, J, np.max(change, axis=0)
 
 
-def of_torch(part: Part, z: Array) -> tuple[Array, Array]:
+def of_torch(part: ExportPart, z: Array) -> tuple[Array, Array]:
     """Values [N, m] and first derivatives [N, m, n] by torch, in float64."""
     rows = torch.from_numpy(z.copy()).requires_grad_(True)
     y = part.torch(*torch.split(rows, part.sizes, dim=1))
@@ -162,7 +162,7 @@ def of_casadi(function: ca.Function) -> tuple[Rows, Rows]:
     return values, slopes
 
 
-def findings(part: Part, backend: str, dtype: str, z: Array, values: Rows, slopes: Rows | None = None,
+def findings(part: ExportPart, backend: str, dtype: str, z: Array, values: Rows, slopes: Rows | None = None,
              reference: Reference | None = None) -> list[Finding]:
     """A backend's largest errors in values, and in first derivatives where it has them."""
     y, J, change = reference or reference_of(part, z)
@@ -181,7 +181,7 @@ def value_scale(z: Array, y: Array, J: Array, dtype: str) -> Array:
     return np.maximum(max(1.0, np.abs(y).max()), np.abs(J) @ np.abs(z).max(axis=0))
 
 
-def _finding(part: Part, backend: str, dtype: str, of: str, z: Array, difference: Array, scale: Array) -> Finding:
+def _finding(part: ExportPart, backend: str, dtype: str, of: str, z: Array, difference: Array, scale: Array) -> Finding:
     error = (np.abs(difference) / scale).reshape(len(z), -1).max(axis=1)
     worst = int(np.argmax(np.where(np.isnan(error), np.inf, error)))
     parts = np.split(z[worst], np.cumsum(part.sizes)[:-1])

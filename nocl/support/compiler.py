@@ -77,7 +77,7 @@ def library(kind: str, identity: Sequence[Any], build: Callable[[Path], Path],
     """
     name = f"{kind}-{fingerprint(identity, command(), _version(command()), processor())}"
     folder = cache_folder(cache)
-    found = _whole(folder, name)
+    found = whole_of(folder, name)
     if found is not None:
         return found
     with tempfile.TemporaryDirectory(dir=own_folder()) as scratch:  # a kill while building leaves the cache as it was
@@ -103,7 +103,7 @@ def _file(name: str, content: bytes) -> str:
     return f"{name}-{sha256(content)[:16]}.so"
 
 
-def _whole(folder: Path, name: str) -> Path | None:
+def whole_of(folder: Path, name: str) -> Path | None:
     """A file of this name whose content is what it says. Others stay: someone may be replacing them right now."""
     for path in folder.glob(f"{name}-*.so"):
         try:
@@ -147,7 +147,7 @@ def own_folder() -> Path:
 
 @lru_cache
 def _own_folder() -> tuple[tempfile.TemporaryDirectory[str], IO[bytes]]:
-    _remove_left()
+    remove_left()
     folder = tempfile.TemporaryDirectory(prefix=OWN, ignore_cleanup_errors=True)
     part = Path(folder.name, "part")
     held = part.open("wb")  # kept open: the system lets the lock go when the process ends, whatever ends it
@@ -156,7 +156,7 @@ def _own_folder() -> tuple[tempfile.TemporaryDirectory[str], IO[bytes]]:
     return folder, held
 
 
-def _remove_left() -> None:
+def remove_left() -> None:
     for lock in Path(tempfile.gettempdir()).glob(f"{OWN}*/{LOCK}"):
         try:
             with lock.open("rb") as file:

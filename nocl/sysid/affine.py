@@ -8,7 +8,7 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 
-from nocl.sysid.structure import Box, Expansion, Group, Split, Structure, describe, with_jacobian
+from nocl.sysid.structure import Expansion, Group, Split, Structure, Variables, describe, with_jacobian
 
 
 def affine_in_controls(found: Structure) -> Structure | None:
@@ -47,7 +47,7 @@ def stated_affine(found: Structure) -> Structure | None:
     return affine_in_controls(found) if sees_controls else found
 
 
-def split_at(box: Box, w: Sequence[int]) -> Split:
+def split_at(box: Variables, w: Sequence[int]) -> Split:
     """The split by these affine controls, each from the point nearest to 0 to the farther end of its bounds."""
     w0 = np.clip(0.0, box.lb[list(w)], box.ub[list(w)])
     up, down = box.ub[list(w)] - w0, box.lb[list(w)] - w0

@@ -18,7 +18,7 @@ from nocl.support.checks import Array
 from nocl.sysid import fitting
 from nocl.sysid.logs.derivatives import labels
 from nocl.sysid.logs.log import Log, Recording
-from nocl.sysid.logs.shooting import Stage, fit_simulation, lengths, spread_of
+from nocl.sysid.logs.shooting import WindowFit, fit_simulation, lengths, spread_of
 from nocl.sysid.networks import assemble
 from nocl.sysid.progress import Progress
 from nocl.sysid.settings import LogSettings
@@ -28,7 +28,7 @@ MEMORY = 30  # of L-BFGS
 
 
 def fit_log(log: Log, parts: Structure, settings: LogSettings, seed: int,
-            bar: Progress) -> tuple[FeatureNet, list[Stage]]:
+            bar: Progress) -> tuple[FeatureNet, list[WindowFit]]:
     """f_theta of the given structure, fitted to a log, and how the simulation error went down.
 
     Raises ValueError where no finite weights were found.

@@ -24,7 +24,7 @@ from torch import Tensor
 from nocl import records
 from nocl.data import Dataset
 from nocl.exports.casadi_forms import to_casadi
-from nocl.exports.parity import Part
+from nocl.exports.parity import ExportPart
 from nocl.nets import MLP, FeatureNet
 from nocl.sampling import Seed
 from nocl.support import checks
@@ -37,14 +37,14 @@ from nocl.sysid.labels import Source, box_of, data_box, find_structure, labelled
 from nocl.sysid.logs.coverage import Coverage, share_of_nodes
 from nocl.sysid.logs.known_rows import contradictions_of
 from nocl.sysid.logs.log import Log
-from nocl.sysid.logs.shooting import Stage
+from nocl.sysid.logs.shooting import WindowFit
 from nocl.sysid.logs.validation import HORIZONS, Validation, validate
 from nocl.sysid.networks import assemble, fit_group, fit_groups, weights_of
 from nocl.sysid.progress import Checkpoint, Progress
 from nocl.sysid.score import Score, contradictions, score_of
 from nocl.sysid.settings import LogSettings, PaperSettings, Settings
 from nocl.sysid.stated import Known, Stated
-from nocl.sysid.structure import Box, Expansion, Group, Split, Structure
+from nocl.sysid.structure import Expansion, Group, Split, Structure, Variables
 from nocl.sysid.trial import better_affine
 from nocl.system import System
 
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 __all__ = ["LearnedDynamics", "LogSettings", "PaperSettings", "Score", "Settings", "identify"]
 
-METHODS = ("default", "mlp", "paper")
+RECIPES = ("default", "mlp", "paper")
 KIND = "dynamics"
 NO_BETTER = 0.5  # of the error of standing still: a model of a log that is warned of
 
@@ -79,14 +79,14 @@ class LearnedDynamics:
         """f:(x, u)->(xdot), native MX, equal to torch to rounding."""
         return to_casadi(self.net, name="f", in_names=["x", "u"], out_names=["xdot"])
 
-    def export_parts(self) -> list[Part]:
+    def export_parts(self) -> list[ExportPart]:
         """What nocl.exports.bundle.export writes: f_theta."""
         s = self.system
         box = {"x": (s.lbx, s.ubx), "u": (s.lbu, s.ubu)}
         labels = {"x": [s.unit(n) for n in s.state_names], "u": [s.unit(n) for n in s.control_names],
                   "xdot": [f"d {n} / dt" for n in s.state_names]}
         net = copy.deepcopy(self.net).double().eval()
-        return [Part("dynamics", self.to_casadi(), net, box, labels, net)]
+        return [ExportPart("dynamics", self.to_casadi(), net, box, labels, net)]
 
     def to_system(self) -> System:
         """The system with f_theta for its equations, in its own symbols: for problems on a plant that is not known.
@@ -266,7 +266,7 @@ def _warn_of(contradictions: list[str], who: str, level: int) -> None:
                       UserWarning, stacklevel=level)
 
 
-def _warn_of_no_progress(stages: list[Stage], seen: Validation) -> None:
+def _warn_of_no_progress(stages: list[WindowFit], seen: Validation) -> None:
     """A UserWarning where a fit to a log came to nothing."""
     if stages and stages[0].failed:
         warnings.warn(f"identify: no step lowered the simulation error, not even over {stages[0].steps} samples "
@@ -288,8 +288,8 @@ def _check_arguments(system: System, method: str, settings: Settings | PaperSett
     if not isinstance(system, System):
         raise ValueError(f"identify: system is a {type(system).__name__}; expected a nocl.System: "
                          "of an OCP, pass ocp.system")
-    if method not in METHODS:
-        raise ValueError(f"identify: method is {method!r}; expected one of {', '.join(METHODS)}")
+    if method not in RECIPES:
+        raise ValueError(f"identify: method is {method!r}; expected one of {', '.join(RECIPES)}")
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
         raise ValueError(f"identify: seed is {seed!r}; expected an integer >= 0")
     if isinstance(data, Log) and method != "default":
@@ -339,7 +339,8 @@ def _structure_data(parts: Structure) -> dict[str, Any]:
             "lb": split.box.lb.tolist(), "ub": split.box.ub.tolist()}
 
 
-def _structure_from(data: Mapping[str, Any] | None, functions: Mapping[str, ca.Function], box: Box) -> Structure | None:
+def _structure_from(data: Mapping[str, Any] | None, functions: Mapping[str, ca.Function],
+                    box: Variables) -> Structure | None:
     if data is None:
         return None
     box = replace(box, lb=np.array(data["lb"]), ub=np.array(data["ub"]))

@@ -15,23 +15,23 @@ from nocl.sysid import structure as structures
 from nocl.sysid.affine import stated_affine
 from nocl.sysid.settings import Settings
 from nocl.sysid.stated import Stated
-from nocl.sysid.structure import Box, Oracle, Structure
+from nocl.sysid.structure import Oracle, Structure, Variables
 from nocl.system import System
 
 CHUNK = 100_000  # labels of f held at a time
 MIN_ROWS = 2048  # of labels, however many labels of f one takes
 
 
-def box_of(system: System) -> Box:
+def box_of(system: System) -> Variables:
     lb, ub = np.r_[system.lbx, system.lbu], np.r_[system.ubx, system.ubu]
-    return Box(system.names, lb, ub, system.nx, system.angle_indices)
+    return Variables(system.names, lb, ub, system.nx, system.angle_indices)
 
 
 @dataclass(eq=False)
 class Source:
     """Where labels come from: the system as a black box, or given data."""
 
-    box: Box
+    box: Variables
     gradients: bool
     oracle: Oracle | None  # counts what it is asked
     data: tuple[Array, Array, Array | None] | None  # z, f, df/dz
@@ -84,7 +84,7 @@ def _checked_data(system: System, data: Dataset) -> tuple[Array, Array, Array | 
     return np.hstack([arrays["x"], arrays["u"]]), arrays["xdot"], gradient
 
 
-def data_box(system: System, z: Array) -> Box:
+def data_box(system: System, z: Array) -> Variables:
     """The box that the data fill; the system's where they do not vary."""
     box, lb, ub = box_of(system), z.min(axis=0), z.max(axis=0)
     still = ub - lb <= 1e-9 * box.width

@@ -18,7 +18,7 @@ from nocl.sysid.labels import LabelPool, Source, draw_pool, labelled
 from nocl.sysid.plain import train as train_plain
 from nocl.sysid.progress import Checkpoint, Progress
 from nocl.sysid.settings import Budget, Settings
-from nocl.sysid.structure import Box, Group, Structure
+from nocl.sysid.structure import Group, Structure, Variables
 
 MAX_POLISHED = 2600  # parameters: beyond, a Levenberg-Marquardt step costs more than it gives
 PROBES = 256  # rows at which the frequencies of the first layer are measured
@@ -55,12 +55,12 @@ def fit_group(parts: Structure, pool: LabelPool, index: int, settings: Settings,
               frequency: list[Tensor] | None = None) -> fitting.Weights:
     """Train one network, from `old` weights without SOAP's large steps; its weights in the units of its labels."""
     group = parts.groups[index]
-    samples, mean, spread = _samples(parts, pool, index, settings.angles)
+    samples, mean, spread = samples_of(parts, pool, index, settings.angles)
     draws = Draws(samples, settings.gradient_weight, torch.Generator().manual_seed(seed * 1000 + index))
     angles = settings.angles and set(group.variables) & set(parts.split.box.angles)
     plain = draws.variables > PLAIN and not angles and samples.mix is None
     budget = settings.budget(len(group.variables), plain)
-    widest = _widest(samples.phi.shape[1], samples.outputs, draws.labels)
+    widest = widest_net(samples.phi.shape[1], samples.outputs, draws.labels)
     few = widest < budget.width
     if few:
         budget = replace(budget, width=widest, polish=LONGER * budget.polish)
@@ -100,7 +100,7 @@ def _can_be_polished(weights: fitting.Weights) -> bool:
     return sum(w.numel() for w in weights) <= MAX_POLISHED
 
 
-def _widest(features: int, outputs: int, labels: int) -> int:
+def widest_net(features: int, outputs: int, labels: int) -> int:
     """The width h of the hidden layers at which half as many weights as labels fit, or NARROWEST.
 
     h^2 + h (F + 2) + m (h + 1 + F) weights of F features and m outputs: networks with more of them swing between the
@@ -140,7 +140,7 @@ def _scaled(weights: fitting.Weights, shift: Array, scale: Array) -> Tensor:
     return W3
 
 
-def _features(box: Box, group: Group, z: ca.SX, angles: bool) -> tuple[list[ca.SX], list[int]]:
+def _features(box: Variables, group: Group, z: ca.SX, angles: bool) -> tuple[list[ca.SX], list[int]]:
     """(phi: sin and cos of angles and scaled others, the place in the group of the variable that each depends on)."""
     phi, owner = [], []
     for i, k in enumerate(group.variables):
@@ -151,16 +151,16 @@ def _features(box: Box, group: Group, z: ca.SX, angles: bool) -> tuple[list[ca.S
     return phi, owner
 
 
-def _centre(box: Box) -> Array:
+def _centre(box: Variables) -> Array:
     return (box.lb + box.ub) / 2
 
 
-def _spread(box: Box) -> Array:
+def _spread(box: Variables) -> Array:
     """The standard deviation of uniform samples: the unit in which variables and derivatives are measured."""
     return box.width / np.sqrt(12)
 
 
-def _samples(parts: Structure, pool: LabelPool, index: int, angles: bool) -> tuple[fitting.Samples, Array, Array]:
+def samples_of(parts: Structure, pool: LabelPool, index: int, angles: bool) -> tuple[fitting.Samples, Array, Array]:
     """(normalised samples of a group, the mean and spread that its network's outputs were normalised by)."""
     box, group, z = parts.split.box, parts.groups[index], ca.SX.sym("z", parts.split.box.nz)
     phi, owner = _features(box, group, z, angles)

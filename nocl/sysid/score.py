@@ -12,7 +12,7 @@ from nocl.data import Dataset
 from nocl.nets import FeatureNet
 from nocl.support.checks import Array
 from nocl.sysid.stated import Stated
-from nocl.sysid.structure import Box
+from nocl.sysid.structure import Variables
 
 MISSED, BENT = 0.05, 0.3  # of their spread: what known rows, and slopes in affine controls, may miss the labels by
 
@@ -54,7 +54,7 @@ def value_and_jacobian(net: FeatureNet, x: Tensor, u: Tensor) -> tuple[Array, Ar
     return y.detach().numpy(), torch.stack(rows, 1).numpy()
 
 
-def contradictions(net: FeatureNet, box: Box, stated: Stated, z: Array, value: Array,
+def contradictions(net: FeatureNet, box: Variables, stated: Stated, z: Array, value: Array,
                    gradient: Array | None) -> list[str]:
     """What is stated and the labels speak against, in words: known rows, and slopes in affine controls."""
     x, u = (torch.from_numpy(np.ascontiguousarray(a)) for a in np.split(z, [box.nx], axis=1))

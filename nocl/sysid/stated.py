@@ -13,7 +13,7 @@ from nocl.data import Dataset
 from nocl.support import checks
 from nocl.sysid import structure as structures
 from nocl.sysid.affine import split_at
-from nocl.sysid.structure import Box, Expansion, Group, Oracle, Split, Structure
+from nocl.sysid.structure import Expansion, Group, Oracle, Split, Structure, Variables
 from nocl.system import System
 
 Known = Mapping[str, Any] | Iterable[str]
@@ -48,7 +48,7 @@ class Stated:
     def __bool__(self) -> bool:
         return bool(self.rows) or self.control_affine
 
-    def plain(self, box: Box, words: str = "") -> Structure:
+    def plain(self, box: Variables, words: str = "") -> Structure:
         """The structure that is stated and nothing else: one network of all variables that are left, for all rows."""
         split = Split(box, (), np.zeros(0), np.zeros(0))
         if self.control_affine:
@@ -89,7 +89,7 @@ class Stated:
 
         return left if rows else oracle
 
-    def words(self, box: Box) -> str:
+    def words(self, box: Variables) -> str:
         """'stated: d theta/dt = omega; affine in the controls'."""
         said = [f"d {box.names[i]}/dt = {e}" for i, e in self.rows.items()]
         said += ["affine in the controls"] if self.control_affine else []

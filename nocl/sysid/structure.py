@@ -47,7 +47,7 @@ MAX_EXPANDED = 81  # monomials of an expansion
 
 
 @dataclass(frozen=True, eq=False)
-class Box:
+class Variables:
     """The variables z = (x, u): names, bounds, which are angles; the first nx are states."""
 
     names: tuple[str, ...]
@@ -77,7 +77,7 @@ class Box:
 class Split:
     """f(z) = E_0(r) + sum_j E_j(r) (w_j - w0_j) / h_j; entry e = i (1 + |S|) + j is row i of E_j."""
 
-    box: Box
+    box: Variables
     affine: tuple[int, ...]  # S, as indices into z
     w0: Array  # [|S|]
     h: Array  # [|S|]
@@ -132,7 +132,7 @@ class Expansion:
     Coefficient c = e T + t is C_t of the e-th entry. Without variables, T = 1 and the coefficients are the entries.
     """
 
-    box: Box
+    box: Variables
     entries: tuple[int, ...]
     variables: tuple[int, ...] = ()  # indices into z
     degrees: tuple[int, ...] = ()  # of each variable; angles: 1, in sin and cos
@@ -166,7 +166,7 @@ class Expansion:
         return value.reshape(len(z), -1), gradient.reshape(len(z), len(own) * T, -1)
 
 
-def _nodes(box: Box, k: int, degree: int) -> Array:
+def _nodes(box: Variables, k: int, degree: int) -> Array:
     """Values of variable k that determine a polynomial of this degree; of an angle, a sine and a cosine."""
     centre, half = (box.lb[k] + box.ub[k]) / 2, box.width[k] / 2
     if k in box.angles:
@@ -174,7 +174,7 @@ def _nodes(box: Box, k: int, degree: int) -> Array:
     return centre + half * np.cos(np.pi * np.arange(degree + 1) / max(degree, 1))[::-1]
 
 
-def _powers(box: Box, k: int, degree: int, z: ca.SX) -> list[ca.SX]:
+def _powers(box: Variables, k: int, degree: int, z: ca.SX) -> list[ca.SX]:
     if k in box.angles:
         return [ca.SX(1), ca.sin(z[k]), ca.cos(z[k])]
     unit = z[k] / max(abs(box.lb[k]), abs(box.ub[k]))
@@ -286,7 +286,7 @@ def with_jacobian(z: ca.SX, expressions: Sequence[ca.SX]) -> ca.Function:
     return ca.Function("known", [z], [column, ca.densify(ca.jacobian(column, z))], ["z"], ["value", "jacobian"])
 
 
-def plain(box: Box, words: str = "no structure used: one network of all variables") -> Structure:
+def plain(box: Variables, words: str = "no structure used: one network of all variables") -> Structure:
     """One network z -> f, nothing known."""
     z, zero = ca.SX.sym("z", box.nz), [ca.SX(0)] * box.nx
     group = Group(tuple(range(box.nz)), tuple(range(box.nx)))
@@ -294,7 +294,7 @@ def plain(box: Box, words: str = "no structure used: one network of all variable
                      (Expansion(box, tuple(range(box.nx))),), with_jacobian(z, zero), (group,), words, 0)
 
 
-def find(oracle: Oracle, box: Box, *, seed: int = 0, probes: int = 64, features: bool = True) -> Structure:
+def find(oracle: Oracle, box: Variables, *, seed: int = 0, probes: int = 64, features: bool = True) -> Structure:
     """The structure of the black box f on its box, from some thousand labels.
 
     With `features`, polynomials in the variables and in sin, cos of angles count as known once they hold at fresh
@@ -328,7 +328,7 @@ def _constant(size: Array) -> Callable[[Array], Array]:
     return lambda _: size
 
 
-def read(z: Array, value: Array, gradient: Array, box: Box, *, features: bool = True) -> Structure:
+def read(z: Array, value: Array, gradient: Array, box: Variables, *, features: bool = True) -> Structure:
     """The structure that given labels show: rows z [N, nz], f [N, nx], df/dz [N, nx, nz]; constant slopes, polynomials.
 
     What is affine in the controls cannot be told from scattered samples; see nocl.sysid.affine.
@@ -357,7 +357,7 @@ def read(z: Array, value: Array, gradient: Array, box: Box, *, features: bool = 
 class _Pass:
     """Finds what is exact in a family of functions of z that can be labelled anywhere in the box."""
 
-    def __init__(self, box: Box, labels: LabelFunction, scale: Callable[[Array], Array], rest: tuple[int, ...],
+    def __init__(self, box: Variables, labels: LabelFunction, scale: Callable[[Array], Array], rest: tuple[int, ...],
                  rng: np.random.Generator, probes: int, z: ca.SX | None = None) -> None:
         self.box, self.labels, self.scale, self.rest, self.rng, self.probes = box, labels, scale, rest, rng, probes
         self.z = ca.SX.sym("z", box.nz) if z is None else z
@@ -376,7 +376,7 @@ class _Pass:
         return _known(self.box, slopes, self.draw, self.scale, self.z, self.rest, features)
 
 
-def _known(box: Box, slopes: Array, draw: Draw, scale: Callable[[Array], Array], z: ca.SX,
+def _known(box: Variables, slopes: Array, draw: Draw, scale: Callable[[Array], Array], z: ca.SX,
            rest: Sequence[int], features: bool) -> tuple[list[ca.SX], dict[int, tuple[int, ...]]]:
     """(exact parts, variables of the others) from constant slopes [E, nz] and, for polynomials, fresh samples."""
     known = [_linear(row, z) for row in slopes]
@@ -400,7 +400,7 @@ def _grouped(variables: Mapping[int, tuple[int, ...]]) -> tuple[Group, ...]:
     return tuple(Group(v, tuple(members)) for v, members in groups.items())
 
 
-def _expansions(box: Box, entries: LabelFunction, scale: Array, variables: Mapping[int, tuple[int, ...]],
+def _expansions(box: Variables, entries: LabelFunction, scale: Array, variables: Mapping[int, tuple[int, ...]],
                 rng: np.random.Generator, probes: int) -> tuple[Expansion, ...]:
     """The entries by the variables in which they are polynomials of a low degree."""
     union = sorted({k for v in variables.values() for k in v})
@@ -418,7 +418,7 @@ def _columns(pairs: Sequence[tuple[int, int]]) -> tuple[tuple[int, ...], tuple[i
     return tuple(k for k, _ in pairs), tuple(d for _, d in pairs)
 
 
-def _degrees(box: Box, entries: LabelFunction, scale: Array, k: int, rng: np.random.Generator,
+def _degrees(box: Variables, entries: LabelFunction, scale: Array, k: int, rng: np.random.Generator,
              probes: int) -> NDArray[np.int_]:
     """The lowest degree up to 3 of each entry in variable k (angles: 1, in sin and cos); 0 where there is none. [E]"""
     z = box.sample(probes, rng)
@@ -447,7 +447,7 @@ class _Counter:
         return self.oracle(x, u)
 
 
-def affine_split(oracle: Oracle, box: Box, rng: np.random.Generator, probes: int = 64) -> Split:
+def affine_split(oracle: Oracle, box: Variables, rng: np.random.Generator, probes: int = 64) -> Split:
     """The largest set of controls whose columns of df/dz do not change with any control of the set."""
     base = box.sample(probes, rng)
     _, J = label(oracle, base, box.nx)
@@ -479,14 +479,14 @@ def _largest_free(conflict: NDArray[np.bool_], candidates: Sequence[int]) -> tup
     return ()
 
 
-def _moved(z: Array, box: Box, k: int, rng: np.random.Generator) -> Array:
+def _moved(z: Array, box: Variables, k: int, rng: np.random.Generator) -> Array:
     """z with variable k moved by 1/5 to 4/5 of its range, cyclically."""
     moved = z.copy()
     moved[:, k] = box.lb[k] + (z[:, k] - box.lb[k] + box.width[k] * rng.uniform(0.2, 0.8, len(z))) % box.width[k]
     return moved
 
 
-def _slopes(labels: LabelFunction, scale: Callable[[Array], Array], box: Box, rest: Sequence[int],
+def _slopes(labels: LabelFunction, scale: Callable[[Array], Array], box: Variables, rest: Sequence[int],
             rng: np.random.Generator, probes: int) -> Array:
     """Each function's constant slope in each variable: 0 where it does not enter, NaN where the slope varies. [E, nz]
 
@@ -512,7 +512,7 @@ def _linear(slopes: Array, z: ca.SX) -> ca.SX:
     return sum((float(s) * z[k] for k, s in enumerate(slopes) if np.isfinite(s) and s != 0), ca.SX(0))
 
 
-def _polynomials(box: Box, draw: Draw, scale: Callable[[Array], Array], group: Group, known: Sequence[ca.SX],
+def _polynomials(box: Variables, draw: Draw, scale: Callable[[Array], Array], group: Group, known: Sequence[ca.SX],
                  z: ca.SX) -> dict[int, ca.SX]:
     """Those of a group that are polynomials in features, of the lowest degree that holds at fresh points."""
     found: dict[int, ca.SX] = {}
@@ -547,7 +547,7 @@ def _sparse_fit(basis: Array, target: Array, tolerance: float) -> Array:
     return sparse / size
 
 
-def _monomials(box: Box, variables: Sequence[int], z: ca.SX, degree: int) -> list[ca.SX]:
+def _monomials(box: Variables, variables: Sequence[int], z: ca.SX, degree: int) -> list[ca.SX]:
     """Products of at most `degree` features: the variables, and sin and cos of angles (sin^2 = 1 - cos^2 left out)."""
     features: list[tuple[ca.SX, int | None]] = []  # (expression, index of the angle whose sine it is)
     for k in variables:
@@ -597,7 +597,7 @@ def _polynomial_words(expansion: Expansion, split: Split, entries: Sequence[int]
     return f"{_and(_derivative(box, i) for i in sorted({e // split.columns for e in entries}))} {_and(kinds)}"
 
 
-def _derivative(box: Box, i: int) -> str:
+def _derivative(box: Variables, i: int) -> str:
     return f"d {box.names[i]}/dt"
 
 

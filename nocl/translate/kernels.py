@@ -22,16 +22,16 @@ HEADERS = Path(__file__).parent / "csrc"
 FLAGS = ("-std=gnu11", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-flax-vector-conversions",
          "-Wno-psabi", "-fPIC", "-shared")
 
-_BINARY = {"OP_ADD": "{} + {}", "OP_SUB": "{} - {}", "OP_MUL": "{} * {}", "OP_DIV": "{} / {}",
+C_BINARY = {"OP_ADD": "{} + {}", "OP_SUB": "{} - {}", "OP_MUL": "{} * {}", "OP_DIV": "{} / {}",
            "OP_LT": "truth({} < {})", "OP_LE": "truth({} <= {})", "OP_EQ": "truth({} == {})",
            "OP_NE": "truth({} != {})", "OP_AND": "truth(({} != 0) & ({} != 0))",
            "OP_OR": "truth(({} != 0) | ({} != 0))", "OP_IF_ELSE_ZERO": "where({} != 0, {}, (lane){{0}})",
            "OP_POW": "v_pow({}, {})", "OP_CONSTPOW": "v_pow({}, {})", "OP_ATAN2": "v_atan2({}, {})",
            "OP_HYPOT": "v_hypot({}, {})", "OP_FMOD": "v_fmod({}, {})", "OP_REMAINDER": "v_remainder({}, {})",
            "OP_COPYSIGN": "v_copysign({}, {})", "OP_FMIN": "v_fmin({}, {})", "OP_FMAX": "v_fmax({}, {})"}
-_UNARY = {"OP_ASSIGN": "{}", "OP_NEG": "-{}", "OP_SQ": "{0} * {0}", "OP_TWICE": "{0} + {0}", "OP_INV": "1 / {}",
+C_UNARY = {"OP_ASSIGN": "{}", "OP_NEG": "-{}", "OP_SQ": "{0} * {0}", "OP_TWICE": "{0} + {0}", "OP_INV": "1 / {}",
           "OP_NOT": "truth({} == 0)"}
-_UNARY |= {f"OP_{name.upper()}": f"v_{name}({{}})" for name in (
+C_UNARY |= {f"OP_{name.upper()}": f"v_{name}({{}})" for name in (
     "sqrt", "exp", "log", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh",
     "atanh", "floor", "ceil", "fabs", "sign", "erf", "log1p", "expm1")}
 
@@ -66,7 +66,7 @@ def _constant(value: float) -> str:
 
 
 def _operation(op: str, args: list[str], function: str) -> str:
-    template = _BINARY.get(op) if len(args) == 2 else _UNARY.get(op)
+    template = C_BINARY.get(op) if len(args) == 2 else C_UNARY.get(op)
     if template is None:
         raise ValueError(f"{function}: CasADi's {op} has no C kernel; rewrite the expression without it")
     return template.format(*args)

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from nocl import records
 from nocl.exports.bundle import export
 from nocl.exports.casadi_forms import to_casadi
-from nocl.exports.parity import Certificate, Part
+from nocl.exports.parity import Certificate, ExportPart
 from nocl.judge import dynamics_function
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
@@ -119,24 +119,25 @@ class CND:
         at = Arguments.of(pi)
         return at.function("closed_loop", {"xdot": ca.densify(at.given(u=at.call(pi)).call(f))})
 
-    def export_parts(self) -> list[Part]:
+    def export_parts(self) -> list[ExportPart]:
         """What is exported: policy, gain and closed loop, and value and value gradient where it has a value."""
         s, policy, value = self.ocp.system, self.policy, self.value_net
         box = {"x": (s.lbx, s.ubx), "t": (0.0, self.ocp.horizon)}
         x, u = ({"x": [s.unit(n) for n in s.state_names]}, [s.unit(n) for n in s.control_names])
         slopes = [f"d {i} / d {j}" for i in s.control_names for j in s.state_names]
-        made = [Part("policy", self.to_casadi(), policy, box | {"u": (s.lbu, s.ubu)}, x | {"u": u}, policy),
-                Part("gain", self.gain_to_casadi(), lambda x, t: _slopes(policy, x, t), box, x | {"K": slopes},
-                     lean=_lean(self.to_casadi(), "gain", "K"))]
+        made = [ExportPart("policy", self.to_casadi(), policy, box | {"u": (s.lbu, s.ubu)}, x | {"u": u}, policy),
+                ExportPart("gain", self.gain_to_casadi(), lambda x, t: _slopes(policy, x, t), box, x | {"K": slopes},
+                           lean=_lean(self.to_casadi(), "gain", "K"))]
         if s.xdot is not None:  # a plant that is not known has no closed loop to write down
             f = to_torch(self.ocp.functions.f)
-            made.append(Part("closed_loop", self.closed_loop_to_casadi(), lambda x, t: f(x, policy(x, t)), box,
-                             x | {"xdot": [f"d {i} / dt" for i in s.state_names]}))
+            made.append(ExportPart("closed_loop", self.closed_loop_to_casadi(), lambda x, t: f(x, policy(x, t)), box,
+                                   x | {"xdot": [f"d {i} / dt" for i in s.state_names]}))
         if value is not None:
-            made += [Part("value", self.value_to_casadi(), value, box, x | {"V": ["cost-to-go"]}, value),
-                     Part("value_gradient", self.value_gradient_to_casadi(), lambda x, t: _slopes(value, x, t), box,
-                          x | {"V_x": [f"d V / d {i}" for i in s.state_names]},
-                          lean=_lean(self.value_to_casadi(), "value_gradient", "V_x"))]
+            made += [ExportPart("value", self.value_to_casadi(), value, box, x | {"V": ["cost-to-go"]}, value),
+                     ExportPart("value_gradient", self.value_gradient_to_casadi(),
+                                lambda x, t: _slopes(value, x, t), box,
+                                x | {"V_x": [f"d V / d {i}" for i in s.state_names]},
+                                lean=_lean(self.value_to_casadi(), "value_gradient", "V_x"))]
         return made
 
     def to_c(self, folder: str | os.PathLike[str], *, dtype: str = "float64",

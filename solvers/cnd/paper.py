@@ -112,7 +112,7 @@ def train_paper(ocp: OCP, dynamics: Any = None, settings: PaperSettings | None =
     Raises ValueError where training diverges, naming the iteration and what to try.
     """
     settings = settings or PaperSettings()
-    trainer = _Trainer(ocp, dynamics, settings, seed, progress, device, dtype)
+    trainer = Trainer(ocp, dynamics, settings, seed, progress, device, dtype)
     named = f"{type(dynamics)}{getattr(dynamics, '__qualname__', '')}"  # of a plain callable its name alone is known
     key = identity(ocp, settings, seed, trainer.f, dtype=str(dtype), dynamics=named)
     run = _Training.resumed(trainer, checkpoint, key) or _Training.raced(trainer)
@@ -126,7 +126,7 @@ def train_paper(ocp: OCP, dynamics: Any = None, settings: PaperSettings | None =
     return policy.to("cpu", torch.float64).eval(), value.to("cpu", torch.float64).eval(), card
 
 
-class _Trainer:
+class Trainer:
     """One training: the problem in torch, and its random numbers."""
 
     def __init__(self, ocp: OCP, dynamics: Any, settings: PaperSettings, seed: int, progress: bool | None,
@@ -164,7 +164,7 @@ class _Trainer:
         s = self.settings
         if s.race == 1:
             return self.starts[0], []
-        policy, parameters = _side_by_side(self.starts)
+        policy, parameters = side_by_side(self.starts)
         adam = torch.optim.Adam(parameters.values(), lr=s.learning_rate)
         recent: list[Tensor] = []
         for _ in (bar := tqdm(range(s.race_iterations), f"{s.race} random controllers", disable=self.hidden)):
@@ -215,7 +215,7 @@ class _Best:
 class _Training:
     """The joint training, from the race's winner or from a checkpoint; what it holds is what a checkpoint keeps."""
 
-    def __init__(self, trainer: _Trainer, policy: FeatureNet, race: list[float], race_seconds: float) -> None:
+    def __init__(self, trainer: Trainer, policy: FeatureNet, race: list[float], race_seconds: float) -> None:
         self.trainer, self.policy, self.value = trainer, policy, trainer.value
         self.race, self.race_seconds, self.seconds = race, race_seconds, race_seconds
         self.groups = [list(policy.parameters()), list(self.value.parameters())]
@@ -225,7 +225,7 @@ class _Training:
         self.rows: list[list[float]] = []
 
     @classmethod
-    def raced(cls, trainer: _Trainer) -> _Training:
+    def raced(cls, trainer: Trainer) -> _Training:
         start = time.perf_counter()
         policy, race = trainer.race()
         return cls(trainer, policy, race, time.perf_counter() - start)
@@ -282,7 +282,7 @@ class _Training:
         store.save_checkpoint(path, state, meta)
 
     @classmethod
-    def resumed(cls, trainer: _Trainer, path: Path | None, key: str) -> _Training | None:
+    def resumed(cls, trainer: Trainer, path: Path | None, key: str) -> _Training | None:
         """The run that a checkpoint of the same call holds; another call's is left aside and overwritten."""
         if path is None or not path.exists():
             return None
@@ -324,7 +324,7 @@ def _fused(ocp: OCP) -> hjb.Step:
         raise ValueError(f"{error}; or set fused=False, which is slower") from None
 
 
-def _side_by_side(nets: Sequence[FeatureNet]) -> tuple[hjb.Map, dict[str, Tensor]]:
+def side_by_side(nets: Sequence[FeatureNet]) -> tuple[hjb.Map, dict[str, Tensor]]:
     """Controllers of one form as a policy on x [M, B, nx], row m by the m-th, and their parameters [M, ...]."""
     parameters, _ = stack_module_state([net.nets[0] for net in nets])
     form, base = nets[0], copy.deepcopy(nets[0].nets[0]).to("meta")

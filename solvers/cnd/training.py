@@ -97,7 +97,7 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
     if method != "default":
         raise ValueError(f"train: method is {method!r}; expected 'default' or 'paper'")
     ocp.check_strict("train")
-    return _Training(ocp, dynamics, _expect(settings, TrainSettings), seed, out, progress).run()
+    return Training(ocp, dynamics, _expect(settings, TrainSettings), seed, out, progress).run()
 
 
 def _check(ocp: OCP, dynamics: LearnedDynamics | None, seed: int, out: str | os.PathLike[str] | None) -> None:
@@ -121,7 +121,7 @@ def _expect(settings: Any, kind: Any) -> Any:
     return settings or kind()
 
 
-class _Training:
+class Training:
     """One run of the default method; its state between rounds is what a checkpoint holds."""
 
     def __init__(self, ocp: OCP, dynamics: LearnedDynamics | None, settings: TrainSettings, seed: int,

@@ -24,11 +24,11 @@ class Descent(Protocol):
     ocp: OCP
     intervals: int
 
-    def descend(self, batch: Batch) -> Solution: ...
+    def descend(self, batch: Piece) -> Solution: ...
 
 
 @dataclass(frozen=True, eq=False)
-class Batch:
+class Piece:
     """A piece of a batch: problems first, first + 1, ... of it; a task of solvers/pool.py."""
 
     name: str
@@ -72,7 +72,7 @@ class Job:
     def build(self) -> None:
         """The kernel is built with the DDP, on unpickling."""
 
-    def __call__(self, task: Batch) -> Solved:
+    def __call__(self, task: Piece) -> Solved:
         return Solved(task.name, task.first, self.ddp.descend(task))
 
 
@@ -82,10 +82,10 @@ def bytes_each(ddp: Descent, curvature: bool) -> int:
     return 8 * (K + 1) * (4 * nx + 4 * nu + 2 * nu * nx + 3 + (nx * nx if curvature else 0))
 
 
-def pieces(ddp: Descent, x0: Array, t0: Array, guess: dict[str, Array], curvature: bool) -> list[Batch]:
+def pieces(ddp: Descent, x0: Array, t0: Array, guess: dict[str, Array], curvature: bool) -> list[Piece]:
     """Pieces of MOST problems, fewer where these would take more than BYTES; the same for any workers."""
     n = max(1, min(MOST, BYTES // bytes_each(ddp, curvature)))
-    return [Batch(f"piece-{i:09d}", i, x0[i:i + n], t0[i:i + n], {k: v[i:i + n] for k, v in guess.items()}, curvature)
+    return [Piece(f"piece-{i:09d}", i, x0[i:i + n], t0[i:i + n], {k: v[i:i + n] for k, v in guess.items()}, curvature)
             for i in range(0, max(len(x0), 1), n)]
 
 

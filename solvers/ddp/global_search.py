@@ -34,7 +34,7 @@ from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
 
-Report = Callable[[str], None]  # told what is being done
+OnMessage = Callable[[str], None]  # told what is being done
 DRAWS = 32  # points from which equilibria are looked for
 NEWTON = 30  # steps to an equilibrium
 CHECKPOINT = "search.safetensors"
@@ -44,7 +44,7 @@ BYTES = 2**31  # guesses and answers that are held at a time, beside the best
 def solve_globally(ddp: DDP, x0: ArrayLike, *, starts: int = 16, neighbours: int = 4, rounds: int = 8, seed: Seed = 0,
                    known: Solution | None = None, workers: int | str = "auto",
                    out: str | os.PathLike[str] | None = None, progress: bool | None = None,
-                   report: Report = lambda _: None) -> Solution:
+                   report: OnMessage = lambda _: None) -> Solution:
     """Solve each problem from cold starts, then from its neighbours' solutions until nothing improves.
 
     nocl.solvers.search says what a round tries.
@@ -108,7 +108,7 @@ def global_ddp(ocp: OCP, intervals: int, seed: int) -> GlobalDDP:
 class _Kept(Search):
     """A search that tells its stages, and keeps what is known after each in a folder, to go on from there."""
 
-    def __init__(self, solver: _States, mirrors: list[Mirror], t: Array, out: Path | None, key: str, report: Report,
+    def __init__(self, solver: _States, mirrors: list[Mirror], t: Array, out: Path | None, key: str, report: OnMessage,
                  **plan: Any) -> None:
         super().__init__(solver, solver.ddp.ocp, mirrors, solver.x0, t, **plan)
         self.folder, self.key, self.report = out, key, report

@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 
 from nocl.data import Solution
 from nocl.ocp import OCP
-from nocl.solvers.ddp.batch import Batch, Job, Rows, assembled, pieces
+from nocl.solvers.ddp.batch import Job, Piece, Rows, assembled, pieces
 from nocl.solvers.ddp.kernel import ddp_source, pack_weights
 from nocl.solvers.ddp.without_compiler import ddp_kernel
 from nocl.support import checks
@@ -87,7 +87,7 @@ class DDP:
         self.evaluations: Counter[str] = Counter()  # of f in this process, one for each state: "rollout", "backward"
         net = None if dynamics is None else _fitting(ocp, dynamics)
         self._weights = np.zeros(1) if net is None else pack_weights(net)
-        self._kernel = ddp_kernel(ocp, dynamics, cache)
+        self.kernel = ddp_kernel(ocp, dynamics, cache)
         self._lb, self._ub = np.ascontiguousarray(ocp.system.lbu), np.ascontiguousarray(ocp.system.ubu)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -125,27 +125,27 @@ class DDP:
         tasks = pieces(self, rows, times, guess, curvature)
         return assembled(len(rows), stream(Job(here), tasks, pool, journal, show, f"DDP, {self.ocp.system.name}"))
 
-    def descend(self, batch: Batch) -> Solution:
+    def descend(self, batch: Piece) -> Solution:
         """Solve one piece of a batch, here."""
-        work = _Work(self, batch.x0, batch.t0, *(batch.guess.get(name) for name in ("u", "x", "gain")))
+        work = Work(self, batch.x0, batch.t0, *(batch.guess.get(name) for name in ("u", "x", "gain")))
         work.descend()
         return work.solution(batch.curvature)
 
     def rollout(self, x0: Array, **guess: Array) -> Array:
         """The states [B, K+1, nx] from x0 [B, nx] at t0 = 0 under a guess of `solve`'s: where the descent begins."""
         given = self._guesses(len(x0), **guess)
-        work = _Work(self, np.ascontiguousarray(x0), np.zeros(len(x0)), *(given.get(k) for k in ("u", "x", "gain")))
+        work = Work(self, np.ascontiguousarray(x0), np.zeros(len(x0)), *(given.get(k) for k in ("u", "x", "gain")))
         return work.x
 
     def feedback(self, x: Array, u: Array) -> Array:
         """Gains [B, K, nu, nx] of one sweep about x [B, K+1, nx], u [B, K, nu]: those of the OCP's cost, damped until
         it is convex there; 0 where no damping helps."""
         B, s = len(x), self.settings
-        work = _Work(self, np.ascontiguousarray(x[:, 0]), np.zeros(B), None, None, None)
+        work = Work(self, np.ascontiguousarray(x[:, 0]), np.zeros(B), None, None, None)
         work.x[:], work.u[:] = x, u
         rows = np.arange(B)
         while rows.size:
-            work._backward(rows)
+            work.backward(rows)
             rows = rows[work.positive[rows] == 0]
             work.mu[rows] = np.maximum(GROWTH * work.mu[rows], s.damping)
             work.gain[rows] = 0.0
@@ -192,7 +192,7 @@ class DDP:
 
 
 @dataclass
-class _Work:
+class Work:
     """The state of a batch while it descends."""
 
     ddp: DDP
@@ -218,21 +218,21 @@ class _Work:
         u = np.broadcast_to(ocp.u_goal, (B, K, nu)).copy() if self.guess_u is None else self.guess_u
         x = self.x if self.guess_x is None else self.guess_x
         gain = self.gain if self.guess_gain is None else self.guess_gain
-        self._rollout(np.arange(B), x, u, gain)
+        self.rollout(np.arange(B), x, u, gain)
         self.x[:], self.u[:], self.J = self.new_x, self.new_u, self.new_J.copy()
         self.state[~np.isfinite(self.J)] = BLEW_UP
 
-    def _rollout(self, rows: Rows, x_bar: Array, u_bar: Array, gain: Array) -> None:
+    def rollout(self, rows: Rows, x_bar: Array, u_bar: Array, gain: Array) -> None:
         d = self.ddp
         d.evaluations["rollout"] += STAGES * d.intervals * len(rows)
-        d._kernel("nocl_rollout", rows, d.intervals, d._weights, d._lb, d._ub, self.h, self.x0, x_bar, u_bar, self.k,
+        d.kernel("nocl_rollout", rows, d.intervals, d._weights, d._lb, d._ub, self.h, self.x0, x_bar, u_bar, self.k,
                   gain, self.alpha, self.new_x, self.new_u, self.new_J, threads=d.threads)
 
-    def _backward(self, rows: Rows, V: Array | None = None, V_x: Array | None = None,
+    def backward(self, rows: Rows, V: Array | None = None, V_x: Array | None = None,
                   V_xx: Array | None = None) -> None:
         d = self.ddp
         d.evaluations["backward"] += STAGES * d.intervals * len(rows)  # with first and second derivatives
-        d._kernel("nocl_backward", rows, d.intervals, d._weights, d._lb, d._ub, self.h, self.x, self.u, self.mu, self.k,
+        d.kernel("nocl_backward", rows, d.intervals, d._weights, d._lb, d._ub, self.h, self.x, self.u, self.mu, self.k,
                   self.gain, self.slope, self.curve, self.positive, V, V_x, V_xx, threads=d.threads)
 
     def descend(self) -> None:
@@ -241,7 +241,7 @@ class _Work:
             self.state[rows[self.iterations[rows] >= s.max_iterations]] = OUT_OF_ITERATIONS
             rows = rows[self.state[rows] == RUNNING]
             self.iterations[rows] += 1
-            self._backward(rows)
+            self.backward(rows)
             good, bad = rows[self.positive[rows] > 0], rows[self.positive[rows] == 0]
             self.refused[bad] = np.maximum(self.refused[bad], self.mu[bad])
             self._damp(bad)
@@ -261,7 +261,7 @@ class _Work:
     def _last_step(self, rows: Rows) -> None:
         """One more full Newton step where J does not rise: what is left of u's error is squared."""
         self.alpha[rows] = 1.0
-        self._rollout(rows, self.x, self.u, self.gain)
+        self.rollout(rows, self.x, self.u, self.gain)
         won = rows[self.new_J[rows] <= self.J[rows] + 4e-15 * np.abs(self.J[rows])]  # rounding decides nothing
         self._take(won)
 
@@ -273,7 +273,7 @@ class _Work:
         """Halve each problem's step until J falls by a share of what was predicted; damp those that never do."""
         self.alpha[rows] = 1.0
         while rows.size:
-            self._rollout(rows, self.x, self.u, self.gain)
+            self.rollout(rows, self.x, self.u, self.gain)
             a = self.alpha[rows]
             predicted = a * self.slope[rows] + a * a * self.curve[rows]
             done = self.new_J[rows] - self.J[rows] <= 1e-3 * np.minimum(predicted, 0.0)  # False for NaN
@@ -301,7 +301,7 @@ class _Work:
         V, V_x = np.zeros((B, K + 1)), np.zeros((B, K + 1, nx))
         V_xx = np.zeros((B, K + 1, nx, nx)) if curvature else None
         self.mu[:] = 0
-        self._backward(np.arange(B), V, V_x, V_xx)
+        self.backward(np.arange(B), V, V_x, V_xx)
         success = self.state == CONVERGED
         t = self.t0[:, None] + self.h[:, None] * np.arange(K + 1)
         seconds = np.full(B, (time.perf_counter() - self.begin) / max(B, 1))

@@ -29,12 +29,12 @@ def ddp_kernel(ocp: OCP, dynamics: Any, cache: str | os.PathLike[str] | None) ->
     try:
         return Kernel(ddp_source(ocp, None if dynamics is None else dynamics.net), cache)
     except NoCompilerError as error:
-        _say_once(f"{error}. DDP goes on in CasADi's virtual machine and numpy, with the same numbers, much slower")
+        say_once(f"{error}. DDP goes on in CasADi's virtual machine and numpy, with the same numbers, much slower")
         return NumpyKernel(ocp, dynamics)
 
 
 @lru_cache
-def _say_once(text: str) -> None:
+def say_once(text: str) -> None:
     warnings.warn(text, stacklevel=4)
 
 

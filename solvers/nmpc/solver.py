@@ -114,7 +114,7 @@ class NMPC:
     @cached_property
     def program(self) -> Transcription:
         """The nonlinear program, built once for each problem and settings."""
-        return _program(_Recipe(f"{self.key}{self._folder or ''}", self))
+        return shared_program(_Recipe(f"{self.key}{self._folder or ''}", self))
 
     @property
     def _folder(self) -> Path | None:
@@ -226,7 +226,7 @@ class _Recipe:
 
 
 @lru_cache(maxsize=KEPT)
-def _program(recipe: _Recipe) -> Transcription:
+def shared_program(recipe: _Recipe) -> Transcription:
     m = recipe.nmpc
     return Transcription(m.ocp, dynamics_function(m.ocp, m.dynamics), int(m.intervals), int(m.substeps),
                          m.constraints == "soft", m.solver, tuple(sorted((m.options or {}).items())), m.terminal,

@@ -13,13 +13,13 @@ import numpy as np
 from nocl.support.packages import package
 from nocl.support.store import write_bytes
 
-Table = dict[str, Any]  # column name -> its cells, in order
+Columns = dict[str, Any]  # column name -> its cells, in order
 KINDS = (".csv", ".parquet")
 SEPARATORS = ",;\t"
 COMMA, POINT = re.compile(r"[-+]?\d*,\d+([eE][-+]?\d+)?"), re.compile(r"[-+]?\d*\.\d+([eE][-+]?\d+)?")
 
 
-def read_table(path: Path) -> Table:
+def read_table(path: Path) -> Columns:
     """The columns of a CSV file with a header line, or of a Parquet file; ValueError for anything else."""
     if path.suffix.lower() not in KINDS:
         raise ValueError(f"{path} is no {' or '.join(KINDS)} file; expected one of these: convert it")
@@ -28,7 +28,7 @@ def read_table(path: Path) -> Table:
     return _read_csv(path) if path.suffix.lower() == ".csv" else _read_parquet(path)
 
 
-def write_table(path: Path, columns: Table) -> Path:
+def write_table(path: Path, columns: Columns) -> Path:
     """Write columns as CSV (17 digits, empty cells for NaN) or Parquet, by the suffix; atomically."""
     if path.suffix.lower() not in KINDS:
         raise ValueError(f"{path} is no {' or '.join(KINDS)} file; expected one of these: name it so")
@@ -50,7 +50,7 @@ def _cell(value: Any) -> str:
     return "" if value != value else repr(float(value))
 
 
-def _read_csv(path: Path) -> Table:
+def _read_csv(path: Path) -> Columns:
     """Cells apart by commas, or, as spreadsheets write where numbers have a decimal comma, by semicolons or tabs."""
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
@@ -90,7 +90,7 @@ def _check_repeated(names: list[str], path: Path) -> None:
         raise ValueError(f"{path}: column {', '.join(repeated)} occurs more than once; expected different names")
 
 
-def _read_parquet(path: Path) -> Table:
+def _read_parquet(path: Path) -> Columns:
     parquet, types = package("pyarrow.parquet", "nocl[data]"), package("pyarrow.types", "nocl[data]")
     try:
         table = parquet.read_table(path)

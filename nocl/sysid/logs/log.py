@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.sysid.logs.columns import labels_of, numbers, rows_of, seconds
-from nocl.sysid.logs.files import Table, read_table, write_table
+from nocl.sysid.logs.files import Columns, read_table, write_table
 from nocl.sysid.logs.plausible import check_rate, check_rates, check_times, check_values, unwrapped
 from nocl.sysid.logs.smoothing import Smooth, smooth
 from nocl.system import System, counted
@@ -112,7 +112,7 @@ class Log:
         """Write a CSV or Parquet file that `read` reads as the same log; a piece's last sample has no control."""
         _check_names(self.states, self.controls)
         number = [sum(other.run == r.run for other in self.runs[:i]) for i, r in enumerate(self.runs)]
-        columns: Table = {RUN: np.concatenate([[r.run] * len(r) for r in self.runs]),
+        columns: Columns = {RUN: np.concatenate([[r.run] * len(r) for r in self.runs]),
                           PIECE: np.concatenate([[k] * len(r) for k, r in zip(number, self.runs, strict=True)]),
                           TIME: np.concatenate([r.t for r in self.runs])}
         x = np.concatenate([r.x for r in self.runs])

@@ -100,7 +100,7 @@ def _window(run: Recording, k: int, m: int) -> tuple[Array, Array, Array]:
 
 
 @dataclass(eq=False)
-class _Problem:
+class WindowProblem:
     """The windows, the network whose parameters are fitted, and what they are measured in."""
 
     net: FeatureNet
@@ -179,7 +179,7 @@ class _Problem:
             return x + h / 6 * total, S + hh / 6 * slope
 
     def minimise(self, theta: Tensor, steps: int, enough: float,
-                 report: Callable[[float], None]) -> tuple[Tensor, Tensor, Stage]:
+                 report: Callable[[float], None]) -> tuple[Tensor, Tensor, WindowFit]:
         """(theta, starts) after at most so many damped Gauss-Newton steps, until PATIENCE of them together take off
         less than a share of `enough`, or none helps."""
         start, damping = self.windows.start, 1e-3
@@ -203,7 +203,7 @@ class _Problem:
             report(after**0.5)
             if len(seen) > PATIENCE and after > (1 - enough) * seen[-1 - PATIENCE]:
                 break
-        return theta, start, Stage(self.windows.u.shape[1], seen[0]**0.5, seen[-1]**0.5, len(seen) - 1)
+        return theta, start, WindowFit(self.windows.u.shape[1], seen[0]**0.5, seen[-1]**0.5, len(seen) - 1)
 
     def put(self, states: Sequence[Array], theta: Tensor, start: Tensor) -> None:
         """Write the simulated states of the windows into each run's [K+1, nx]."""
@@ -215,7 +215,7 @@ class _Problem:
 
 
 @dataclass(frozen=True)
-class Stage:
+class WindowFit:
     """What Gauss-Newton steps on windows of one length came to."""
 
     steps: int  # of a window
@@ -239,7 +239,7 @@ def lengths(window: int, log: Log) -> list[int]:
 
 
 def fit_simulation(net: FeatureNet, unit: Array, log: Log, *, window: int, windows: int, steps: int, substeps: int,
-                   ridge: float | None, rng: np.random.Generator, report: Callable[[float], None]) -> list[Stage]:
+                   ridge: float | None, rng: np.random.Generator, report: Callable[[float], None]) -> list[WindowFit]:
     """Gauss-Newton steps on windows that grow as long as they succeed; changes the network.
 
     A short window has a minimum that can be reached from afar, even where the plant is unstable or smoothing was poor;
@@ -247,10 +247,10 @@ def fit_simulation(net: FeatureNet, unit: Array, log: Log, *, window: int, windo
     """
     scale, states = torch.from_numpy(unit), [run.smooth.x.copy() for run in log]
     theta = torch.nn.utils.parameters_to_vector(net.parameters()).detach() / scale
-    stages: list[Stage] = []
+    stages: list[WindowFit] = []
     for m in (all_lengths := lengths(window, log)):
         most = windows * window // m  # as many samples
-        problem = _Problem(net, scale, Windows.of(log, states, m, most, rng), substeps, ridge)
+        problem = WindowProblem(net, scale, Windows.of(log, states, m, most, rng), substeps, ridge)
         theta, start, stage = problem.minimise(theta, steps, LAST if m == all_lengths[-1] else ENOUGH, report)
         stages.append(stage)
         if stage.failed:
