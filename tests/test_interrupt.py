@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from nocl.judge import simulate
-from nocl.solvers import NMPC
 from nocl.support.interrupt import deferred
 from nocl.systems import cartpole
 
@@ -85,11 +84,3 @@ def test_the_judge_stops(monkeypatch):
     pressed_by_the_solver(monkeypatch)
     with pytest.raises(KeyboardInterrupt):
         simulate(ocp, np.zeros((1, 4, 1)), ocp.x_goal)
-
-
-def test_nmpc_stops(monkeypatch):
-    ocp = cartpole.ocp()
-    nmpc = NMPC(ocp, intervals=10, starts=1, passes=0)
-    pressed_by_the_solver(monkeypatch)
-    with pytest.raises(KeyboardInterrupt):
-        nmpc.solve(ocp.x_goal, workers=1)

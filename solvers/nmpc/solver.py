@@ -55,6 +55,8 @@ class NMPC:
     neighbours : how many of them are the nearest states', one more in each round
     constraints : "hard": path constraints at the nodes; "soft": the penalty of ocp.L_soft in the cost instead
     seed : of the random starts
+    time_limit : seconds after which a single solve, from one start, is given up and the others go on; default: generous
+        beside what the other solves took (at least 10 s)
     options : of the nlpsol, like {"ipopt.tol": 1e-6}
     compiled : compile the program by the C compiler, once: into the folder that is named here, or for True into that
         of the environment's NOCL_CACHE (without it: for as long as the process lives); later constructions load it
@@ -74,6 +76,7 @@ class NMPC:
     neighbours: int = field(default=3, kw_only=True)
     constraints: str = field(default="hard", kw_only=True)
     seed: int = field(default=0, kw_only=True)
+    time_limit: float | None = field(default=None, kw_only=True)
     options: Mapping[str, Any] | None = field(default=None, kw_only=True)
     compiled: bool | str | os.PathLike[str] = field(default=False, kw_only=True)
 
@@ -92,6 +95,8 @@ class NMPC:
             raise ValueError(f"NMPC: compiled is {self.compiled!r}; expected True, False, or a folder")
         if checks.number(self.window, "horizon", "NMPC", positive=True) > self.ocp.horizon:
             raise ValueError(f"NMPC: horizon is {self.horizon!r}; expected at most {self.ocp.horizon:g}, the OCP's")
+        if self.time_limit is not None:
+            checks.number(self.time_limit, "time_limit", "NMPC", positive=True)
         if self.dynamics is not None:
             object.__setattr__(self, "dynamics", dynamics_function(self.ocp, self.dynamics))
         object.__setattr__(self, "terminal", _terminal(self.ocp, self.terminal))
@@ -208,8 +213,8 @@ class NMPC:
     def _run_key(self, x0: Array, t: Array, given: list[list[Guess]], *counts: int) -> str:
         """A fingerprint of all that outcomes depend on."""
         arrays = [part for guess in given for row in guess for part in row]
-        return fingerprint(self.key, x0, t, *arrays, counts, self.passes, self.neighbours, self.seed, version("casadi"),
-                           version("nocl"))
+        return fingerprint(self.key, x0, t, *arrays, counts, self.passes, self.neighbours, self.seed, self.time_limit,
+                           version("casadi"), version("nocl"))
 
 
 def closed_loop(ocp: OCP, intervals: int, seed: int) -> Loop:
@@ -288,7 +293,7 @@ class _States:
         """The first time also the guesses that solve was given."""
         name, begun = (f"fresh-{self.number}", True) if self.number else ("start", False)
         tasks = [Task(f"{name}-{i:06d}", i, self.x0[i], self.t, () if begun else [guess[i] for guess in self.given],
-                      0 if begun else self.warm, first, count, self.nmpc.seed) for i in rows]
+                      0 if begun else self.warm, first, count, self.nmpc.seed, self.nmpc.time_limit) for i in rows]
         return self._do(tasks)
 
     def follow(self, moves: Moves, guess: Callable[[Moves], dict[str, Array]]) -> Found:
@@ -296,7 +301,8 @@ class _States:
         for i in np.unique(moves.row):
             made = guess(moves[moves.row == i])
             guesses = [starting.from_neighbour(self.x0[i], x, u) for x, u in zip(made["x"], made["u"], strict=True)]
-            tasks.append(Task(f"round-{self.number}-{i:06d}", int(i), self.x0[i], self.t, guesses))
+            tasks.append(Task(f"round-{self.number}-{i:06d}", int(i), self.x0[i], self.t, guesses,
+                              time_limit=self.nmpc.time_limit))
         return self._do(tasks)
 
     def _do(self, tasks: Sequence[Task]) -> Found:

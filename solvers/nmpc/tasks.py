@@ -12,7 +12,7 @@ import numpy as np
 from nocl.data import Solution
 from nocl.ocp import OCP
 from nocl.solvers.nmpc.guesses import Guess
-from nocl.solvers.nmpc.transcription import FEASIBLE, NOT_A_NUMBER, STOPPED, Answer, Transcription
+from nocl.solvers.nmpc.transcription import FEASIBLE, GIVEN_UP, NOT_A_NUMBER, STOPPED, Answer, Transcription
 from nocl.support.checks import Array
 
 
@@ -29,6 +29,7 @@ class Task:
     begin: int = 0
     starts: int = 0
     seed: int = 0
+    time_limit: float | None = None  # seconds of each solve
     size: int = 1  # states
 
     def outcome(self, arrays: dict[str, Any]) -> Outcome:
@@ -67,10 +68,10 @@ def _answer(arrays: dict[str, Any], kind: str) -> Answer | None:
 
 def attempt(program: Transcription, task: Task, guesses: Sequence[Guess]) -> Outcome:
     """Solve from each guess."""
-    begin, answers = time.perf_counter(), list[Answer]()
+    begin, answers, at = time.perf_counter(), list[Answer](), (task.x0, task.t)
     for i, (x, u) in enumerate(guesses):
-        warm = program.warm.solve(task.x0, task.t, x, u) if i < task.warm else None
-        answers.append(warm if warm is not None and warm.success else program.solve(task.x0, task.t, x, u))
+        warm = program.warm.solve(*at, x, u, task.time_limit) if i < task.warm else None
+        answers.append(warm if warm is not None and warm.success else program.solve(*at, x, u, task.time_limit))
     answers += _second_opinion(program, task, answers)
     seconds = time.perf_counter() - begin
     good, bad = ([a for a in answers if bool(a.success) is ok] for ok in (True, False))
@@ -80,7 +81,8 @@ def attempt(program: Transcription, task: Task, guesses: Sequence[Guess]) -> Out
 
 
 def _second_opinion(program: Transcription, task: Task, answers: Sequence[Answer]) -> list[Answer]:
-    """Where fatrop got stuck from all starts: IPOPT from where it got to, to solve it or to say why not.
+    """Where fatrop got stuck, or had to be given up, from all starts: IPOPT from where it got to, to solve it or to say
+    why not.
 
     From its most feasible point, and from its first one: the most feasible may lead to a poor optimum, and more starts
     must not end higher than one.
@@ -96,7 +98,7 @@ def _second_opinion(program: Transcription, task: Task, answers: Sequence[Answer
 
 
 def _by_ipopt(program: Transcription, task: Task, start: Answer) -> Answer:
-    answer = program.second.solve(task.x0, task.t, start.x, start.u)
+    answer = program.second.solve(task.x0, task.t, start.x, start.u, task.time_limit)
     return replace(answer, message=f"{answer.message}, by IPOPT after fatrop: {start.message}")
 
 
@@ -124,6 +126,8 @@ def failure(program: Transcription, x0: Array, starts: int, failed: Answer | Non
 def _remedy(outcome: str, program: Transcription) -> str:
     if outcome == STOPPED:
         return f"more iterations (options={{'{program.backend}.max_iter': 3000}}), more starts or another guess"
+    if outcome == GIVEN_UP:
+        return "another solver (solver='ipopt'), more starts, another guess, or a longer time_limit"
     soft = ", or constraints='soft'" if program.n_path else ""
     if outcome == NOT_A_NUMBER:
         return "a guess that stays where f, L and h are finite, or bounds lbu, ubu that keep the states there" + soft

@@ -9,6 +9,7 @@ gap's multiplier is minus the costate of the node that it leads to: lambda_{k+1}
 from __future__ import annotations
 
 import os
+import time
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -19,8 +20,9 @@ import numpy as np
 
 from nocl.functions import Functions
 from nocl.ocp import OCP
-from nocl.support import compiler, interrupt
+from nocl.support import compiler
 from nocl.support.checks import Array
+from nocl.support.guard import Guarded, NoAnswerError
 
 BACKENDS: dict[str, dict[str, Any]] = {
     "ipopt": {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-9, "ipopt.max_iter": 500},
@@ -39,6 +41,12 @@ OUTCOMES = {"SOLVER_RET_SUCCESS": "solved", "SOLVER_RET_LIMITED": "stopped at it
             "SOLVER_RET_INFEASIBLE": "infeasible", "SOLVER_RET_NAN": "NaN in a function",
             "SOLVER_RET_UNKNOWN": "not converged"}
 STOPPED, NOT_A_NUMBER, INFEASIBLE = "SOLVER_RET_LIMITED", "SOLVER_RET_NAN", "SOLVER_RET_INFEASIBLE"
+GIVEN_UP = "given up"  # an outcome of our own: the solver did not come back
+LEAST = 10.0  # seconds that a solve has, without a time limit of the user's
+OTHERS = 20.0  # ... or that many times the slowest that came back
+WORK = 10.0  # ... or that many evaluations of the second derivatives in each iteration allowed
+TIMED = 3  # evaluations, of which the fastest counts
+UNLIMITED = 3000  # iterations of a solver whose limit is not known
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,7 +61,7 @@ class Answer:
     message: str
     violation: float  # the largest, of any constraint
     iterations: int
-    outcome: str  # how it ended: a key of OUTCOMES, or CasADi's own name
+    outcome: str  # how it ended: a key of OUTCOMES, GIVEN_UP, or CasADi's own name
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,12 +187,53 @@ class Transcription:
         first = np.r_[s.nx, 0, 2 * s.nx + (s.nx + m) * np.arange(N - 1)]
         return first[:, None] + np.arange(s.nx)
 
-    def solve(self, x0: Array, t: Array, x: Array, u: Array) -> Answer:
-        """Solve from x0 on the nodes t [N+1] with the guess x [N+1, nx], u [N, nu]."""
+    def solve(self, x0: Array, t: Array, x: Array, u: Array, time_limit: float | None = None) -> Answer:
+        """Solve from x0 on the nodes t [N+1] with the guess x [N+1, nx], u [N, nu], in a copy of this process.
+
+        time_limit : seconds; default: `patience`, from what other solves took
+        """
+        begin = time.perf_counter()
+        try:
+            answer: Answer = self._guarded(self.patience if time_limit is None else time_limit, x0, t, x, u)
+        except NoAnswerError as error:
+            return Answer(x, u, np.full_like(x, np.nan), np.inf, False, f"{self.backend} was given up: {error}", np.inf,
+                          0, GIVEN_UP)
+        self._took[0] = max(self._took[0], time.perf_counter() - begin)
+        return answer
+
+    @property
+    def patience(self) -> float:
+        """Seconds after which a solve is given up, generous beside the slowest that came back and beside the work that
+        the solver's own limit of iterations allows it."""
+        iterations = self.max_iter if np.isfinite(self.max_iter) else UNLIMITED
+        return max(LEAST, OTHERS * self._took[0], WORK * iterations * self._evaluation)
+
+    @cached_property
+    def _took(self) -> list[float]:
+        return [0.0]  # seconds of the slowest solve that came back
+
+    @cached_property
+    def _guarded(self) -> Guarded:
+        self.solver  # noqa: B018 - built here, the copies have it
+        return Guarded(self._solve)
+
+    @cached_property
+    def _evaluation(self) -> float:
+        """Seconds of the program's second derivatives, its dearest function, at any point."""
+        name = next((name for name in self.solver.get_function() if "hess" in name), None)
+        if name is None:
+            return 0.0
+        hessian, took = self.solver.get_function(name), list[float]()
+        for _ in range(TIMED):
+            begin = time.perf_counter()
+            hessian(*(ca.DM.zeros(hessian.sparsity_in(i)) for i in range(hessian.n_in())))
+            took.append(time.perf_counter() - begin)
+        return min(took)
+
+    def _solve(self, x0: Array, t: Array, x: Array, u: Array) -> Answer:
         w0 = np.r_[np.c_[x[:-1], u].ravel(), x[-1]]
         solver, p = self.solver, np.r_[x0, np.diff(t), t[-1]]
-        with interrupt.deferred():
-            result = solver(x0=w0, p=p, **self._limits)
+        result = solver(x0=w0, p=p, **self._limits)
         stats = solver.stats()
         X, U = (v.full().T for v in self.split(result["x"]))
         U = np.clip(U, self.ocp.system.lbu, self.ocp.system.ubu)  # IPOPT relaxes bounds by 1e-8
