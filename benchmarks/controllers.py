@@ -52,7 +52,7 @@ VALUE_STATES = 2048  # of the tube, and of kicked rollouts, on which V is judged
 
 def optimum(ocp: OCP, x0: Array, policy: FeatureNet) -> tuple[Solution, SolutionBank]:
     """The best solutions known from x0, on FINE intervals; those found on the usual grid as a bank."""
-    coarse, fine = DDP(ocp), DDP(ocp, intervals=FINE)
+    coarse, fine = DDP(ocp, constraints="soft"), DDP(ocp, intervals=FINE, constraints="soft")
     found = solve_globally(coarse, x0, starts=8, seed=99)
     own = policy_controls(policy, nocl.to_torch(ocp.system.f), x0, np.zeros(len(x0)), ocp.horizon, FINE)
     best = better(fine.solve(x0, u=np.repeat(found.u, FINE // coarse.intervals, axis=1)), fine.solve(x0, u=own))
@@ -63,10 +63,11 @@ def value_errors(ocp: OCP, cnd: nocl.CND, bank: SolutionBank, n: int, seed: int)
     """Mean |V - J*| / |J*|, and V_x against costates (medians), on n states of the tube about the bank's trajectories
     and n of the controller's own kicked rollouts, solved anew; none of them is among those that training drew. States
     that cannot hold the path constraints are left out."""
-    f, fine, rng = nocl.to_torch(ocp.system.f), DDP(ocp, intervals=FINE // 2), np.random.default_rng(seed)
+    f, rng = nocl.to_torch(ocp.system.f), np.random.default_rng(seed)
+    fine = DDP(ocp, intervals=FINE // 2, constraints="soft")
     usual = TrainSettings()
-    sets = {"tube": tube_optima(DDP(ocp), fine, bank, cnd.policy, f, n, usual.width, rng),
-            "tails": kicked_optima(DDP(ocp), fine, bank, cnd.policy, f, n, usual.kick, rng)}
+    sets = {"tube": tube_optima(DDP(ocp, constraints="soft"), fine, bank, cnd.policy, f, n, usual.width, rng),
+            "tails": kicked_optima(DDP(ocp, constraints="soft"), fine, bank, cnd.policy, f, n, usual.kick, rng)}
     sets = {where: feasible(ocp, s) for where, s in sets.items()}
     found, row = value_scores(ocp, cnd.value_net, cnd.policy, f, sets), {}
     for where, s in sets.items():
@@ -83,7 +84,7 @@ def cost_of_kicks(ocp: OCP, policy: FeatureNet, run: Simulation, kicks: list[tup
     after = np.concatenate([run.x[:, slot * nodes] for slot, _ in kicks])
     dx = np.concatenate([dx for _, dx in kicks])
     t = np.repeat([slot * ocp.horizon / SLOTS for slot, _ in kicks], len(run.x))
-    ddp, f, V = DDP(ocp, intervals=FINE // 2), nocl.to_torch(ocp.system.f), []
+    ddp, f, V = DDP(ocp, intervals=FINE // 2, constraints="soft"), nocl.to_torch(ocp.system.f), []
     for x in (after - dx, after):
         V.append(ddp.solve(x, t, u=policy_controls(policy, f, x, t, ocp.horizon, ddp.intervals)).cost)
     with np.errstate(invalid="ignore"):  # inf - inf where neither was solved
@@ -93,7 +94,7 @@ def cost_of_kicks(ocp: OCP, policy: FeatureNet, run: Simulation, kicks: list[tup
 
 def explained(ocp: OCP, x0: Array, gap: float, cost: float) -> dict[str, Any]:
     """One of the worst initial states: what the controller costs there beside the optima of COLD cold starts."""
-    ddp = DDP(ocp)
+    ddp = DDP(ocp, constraints="soft")
     s = ddp.solve(np.repeat(x0[None], COLD, axis=0), u=random_controls(ocp, ddp.intervals, COLD, 5))
     found = np.sort(s.cost[s.success])
     apart = np.append(True, np.diff(found) > 1e-3 * found[:-1]) if len(found) else []

@@ -118,7 +118,8 @@ class _Study:
         s, T = self.settings, self.ocp.horizon
         calm = self.judged("undisturbed", self.runs)
         guesses = [j.simulation.u[:, :-1] for j in calm]
-        cold = solve_globally(DDP(self.ocp), self.x0, starts=STARTS, seed=99, progress=self.progress).u
+        ddp = DDP(self.ocp, constraints="soft")
+        cold = solve_globally(ddp, self.x0, starts=STARTS, seed=99, progress=self.progress).u
         best = Reference(self.ocp, FINE, [cold, *guesses]).solve(self.x0)
         J = best.cost
         found = [self.scenario("undisturbed", "No disturbance.", self.runs, calm, J)]
@@ -188,7 +189,7 @@ class _Study:
                  delays: Sequence[float] | None = None) -> Scenario:
         losses = []
         for run, j, d in zip(runs, judgements, delays or [0.0] * len(runs), strict=True):
-            ok = np.asarray(j.simulation.success & ~(j.simulation.clearance < -VIOLATION), dtype=bool)
+            ok = np.asarray(j.simulation.success & ~(j.simulation.violation > VIOLATION), dtype=bool)
             said = run.how if run.solved is not None else how(run.hold, d)
             losses.append(ScenarioLoss(run.name, said, j.simulation.cost, best, ok, j.ms_per_control))
         return Scenario(name, text, tuple(losses))

@@ -85,7 +85,7 @@ class JudgedShare:
 
 @dataclass(frozen=True, eq=False)
 class Judging:
-    """Does Parts; `delays` [runs] is the time from a sample to its control."""
+    """Judges shares; `delays` [runs] is the time from a sample to its control."""
 
     ocp: OCP
     x0: Array
@@ -234,10 +234,10 @@ def _unknown(s: Simulation) -> Judgement:
 def failed(ocp: OCP, message: Sequence[str], t: Array) -> Simulation:
     """What the judge says of states that there was nothing to run on."""
     B, K = len(message), len(t)
-    inf, nan = np.full((4, B), np.inf), np.full((3, B), np.nan)
+    inf, nan = np.full((4, B), np.inf), np.full((4, B), np.nan)
     x, u = (np.full((B, K, n), np.nan) for n in (ocp.system.nx, ocp.system.nu))
-    return Simulation(t, x, u, inf[0], inf[1], inf[2], inf[3], nan[0], nan[1], nan[2], np.zeros(B, dtype=bool),
-                      list(message))
+    return Simulation(t, x, u, inf[0], inf[1], inf[2], inf[3], nan[0], nan[1], nan[2], nan[3],
+                      np.zeros(B, dtype=bool), list(message))
 
 
 def joined(ocp: OCP, parts: Sequence[Judgement]) -> Judgement:

@@ -34,7 +34,7 @@ class Reference:
 
     def solve(self, x0: Array) -> Solution:
         """The best solution of each state x0 [B, nx]; guesses are of the same states."""
-        ddp = DDP(self.ocp, intervals=self.intervals)
+        ddp = DDP(self.ocp, intervals=self.intervals, constraints="soft")
         best = ddp.solve(x0)
         goal = np.asarray(self.ocp.u_goal)
         for guess in self.guesses:
@@ -60,7 +60,7 @@ def resolved(ocp: OCP, start: Solution, kicks: Sequence[tuple[int, Array]]) -> A
         x = np.where(found[:, None], solution.x[:, node] + dx, ocp.x_goal)  # what is lost may have blown up
         u = np.ascontiguousarray(solution.u[:, node:])
         states, gain = np.ascontiguousarray(solution.x[:, node:]), np.ascontiguousarray(solution.gain[:, node:])
-        ddp, t0 = DDP(ocp, intervals=K - slot * per_slot), slot * ocp.horizon / SLOTS
+        ddp, t0 = DDP(ocp, intervals=K - slot * per_slot, constraints="soft"), slot * ocp.horizon / SLOTS
         solution, now = better(ddp.solve(x, t0, u=u, x=states, gain=gain), ddp.solve(x, t0, u=u)), slot
         found &= solution.success
     return np.where(found, cost + solution.cost, np.inf)

@@ -65,8 +65,8 @@ def succeeds(ocp: OCP, method: Any, x0: Array, within: float) -> Array:
     cold = solve_globally(DDP(ocp, intervals=HELD), x0, starts=STARTS, seed=0, workers=1, progress=False).u
     rival = Reference(ocp, HELD, [own, cold]).solve(x0)
     judged = simulate(ocp, rival.u, x0)
-    fair = rival.success & ~(judged.clearance < -VIOLATION)
+    fair = rival.success & ~(judged.violation > VIOLATION)
     best = np.minimum(run.cost, np.where(fair, judged.cost, np.inf))
-    ok = run.success & ~(run.clearance < -VIOLATION)
+    ok = run.success & ~(run.violation > VIOLATION)
     with np.errstate(invalid="ignore"):
         return np.asarray(ok & (100 * (run.cost - best) <= within * np.maximum(np.abs(best), COST_FLOOR)))

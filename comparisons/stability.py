@@ -118,7 +118,8 @@ def _optimum(report: Report) -> list[Stability]:
         return []
     x0, u = given
     K = INTERVALS // u.shape[1] * u.shape[1] or u.shape[1]
-    found = DDP(ocp, intervals=K).solve(x0, u=np.ascontiguousarray(np.repeat(u, K // u.shape[1], axis=1)))
+    ddp = DDP(ocp, intervals=K, constraints="soft")
+    found = ddp.solve(x0, u=np.ascontiguousarray(np.repeat(u, K // u.shape[1], axis=1)))
     found = found[found.success]
     if not len(found):
         return []

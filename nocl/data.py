@@ -90,6 +90,7 @@ class Solution:
     iterations: NDArray[np.int64]  # [B], of all that was tried
     V_xx: Array | None = None  # [B, K+1, nx, nx]
     tried: Array | None = None  # [B, n], the cost that each start ended at: inf, it failed; NaN, there were fewer
+    clearance: Array | None = None  # [B], min of all path constraints at the nodes; inf where there are none
     dense: Array | None = None  # [B, K, 4, 2 nx]: (x, costate) at both ends of intervals, their time derivatives
 
     def __len__(self) -> int:

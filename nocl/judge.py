@@ -47,6 +47,7 @@ class Simulation:
     control_magnitude: Array  # [B], mean of ||u||_2 over time
     saturation: Array  # [B], share of time with a control at a bound
     clearance: Array  # [B], min of all path constraints, at and between nodes; inf if the problem has none
+    violation: Array  # [B], the largest of any, as a share of that constraint's own scale (OCP.violation); 0: none
     success: Array  # [B] bool
     message: Sequence[str]  # [B], "" or what failed, at which time and state
 
@@ -266,11 +267,11 @@ class _Judge:
         u = np.clip(u, self.ocp.system.lbu, self.ocp.system.ubu)
         weight = np.gradient(t) * np.r_[0.5, np.ones(len(t) - 2), 0.5] if len(t) > 2 else np.diff(t).repeat(2) / 2
         saturation = self.at_bound(u) @ (weight / weight.sum())
-        return self.score(t, x, u, z[:, -1], magnitude / (t[-1] - t[0]), saturation, self.clearance(dense), message)
+        return self.score(t, x, u, z[:, -1], magnitude / (t[-1] - t[0]), saturation, self.ocp.least(dense), message)
 
     def held(self, ask: Ask, x0: Array, t: Array, jumps: list[tuple[float, Array]], delay: float = 0.0) -> Simulation:
         B, nx, K, nu = len(x0), x0.shape[1], len(t) - 1, self.ocp.system.nu
-        step, clearance = _Step(self), np.full(B, np.inf)
+        step, least = _Step(self), np.full((B, len(self.ocp.path_constraints)), np.inf)
         x, u = np.full((B, K + 1, nx), np.nan), np.full((B, K + 1, nu), np.nan)
         z, message = np.c_[x0, np.zeros(B)], [""] * B
         for k in range(K):
@@ -286,12 +287,12 @@ class _Judge:
             for a, b in pairwise(edges):
                 z[:, :nx] += sum(dx for time, dx in middle if time == a)
                 path = step.run(z, u[:, k - 1] if a < late else u[:, k], a, b, message)
-                clearance = np.fmin(clearance, self.clearance(path))
+                least = np.minimum(least, self.ocp.least(path))
         z[:, :nx] += sum(dx for time, dx in jumps if time == t[-1])
         x[:, -1], u[:, -1] = z[:, :nx], u[:, -2]
         magnitude = np.linalg.norm(u[:, :-1], axis=2).mean(axis=1)
-        clearance = np.fmin(clearance, self.clearance(x))
-        return self.score(t, x, u, z[:, -1], magnitude, self.at_bound(u[:, :-1]).mean(axis=1), clearance, message)
+        least = np.minimum(least, self.ocp.least(x))
+        return self.score(t, x, u, z[:, -1], magnitude, self.at_bound(u[:, :-1]).mean(axis=1), least, message)
 
     def at_bound(self, u: Array) -> Array:
         """Whether any control is at a bound, [B, K], as 0 or 1."""
@@ -304,15 +305,8 @@ class _Judge:
         """Times in an interval that the state is recorded at."""
         return BETWEEN if self.ocp.path_constraints else 1
 
-    def clearance(self, x: Array) -> Array:
-        """[B], min of all path constraints over the states x [B, n, nx] that are finite; inf if there are none."""
-        if not self.ocp.path_constraints:
-            return np.full(len(x), np.inf)
-        h = self.ocp.h(x.reshape(-1, x.shape[2]).T).full().reshape(-1, *x.shape[:2])  # [constraints, B, n]
-        return np.where(np.isfinite(h), h, np.inf).min(axis=(0, 2), initial=np.inf)
-
     def score(self, t: Array, x: Array, u: Array, running: Array, magnitude: Array, saturation: Array,
-              clearance: Array, message: list[str]) -> Simulation:
+              least: Array, message: list[str]) -> Simulation:
         success = np.array([not m for m in message])
         x[~success, -1] = np.nan
         terminal = np.where(success, self.ocp.G(x[:, -1].T).full().ravel(), np.inf)
@@ -320,7 +314,8 @@ class _Judge:
         error = np.where(success, np.linalg.norm(self.ocp.from_goal(x[:, -1]), axis=1), np.inf)
         u[~np.isfinite(x).all(axis=2)] = np.nan
         return Simulation(t, x, u, running + terminal, running, terminal, error, np.where(success, magnitude, np.nan),
-                          np.where(success, saturation, np.nan), clearance, success, message)
+                          np.where(success, saturation, np.nan), least.min(axis=1, initial=np.inf),
+                          self.ocp.violation(least), success, message)
 
 
 class _Segment:

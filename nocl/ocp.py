@@ -13,6 +13,7 @@ import casadi as ca
 import numpy as np
 
 from nocl import pretty, sampling
+from nocl.clearance import scales
 from nocl.functions import Functions
 from nocl.sampling import Distribution, Gaussian, Uniform, short
 from nocl.smoothness import kinks, linear_controls
@@ -23,6 +24,7 @@ from nocl.translate import instructions
 
 KINKS = ("solvers that use second derivatives may fail there; smooth it, nocl.smooth_abs(e, width) or "
          "nocl.smooth_max(a, b, width), or split a control, nocl.split_controls(system, names)")
+PLACES = 256  # initial states that constraints are measured at
 N_IMAGES, SAME_IMAGE = 16, 1e-9  # points of the box; relative to usual values, images that agree so far are one
 
 
@@ -225,6 +227,22 @@ class OCP:
     def h(self) -> ca.Function:
         """x -> path constraints [number of them], each >= 0 where it holds."""
         return self.functions.h
+
+    @cached_property
+    def constraint_scales(self) -> Array:
+        """What violations of each path constraint are measured by [number of them]: see nocl/clearance.py."""
+        if not self.path_constraints:
+            return np.zeros(0)
+        return scales(self.functions, np.vstack([self.initial_states.sample(PLACES, 0), self.x_goal]))
+
+    def least(self, x: Array) -> Array:
+        """The least value [B, number of them] of each path constraint along states x [B, n, nx]; inf for NaN."""
+        h = self.h(x.reshape(-1, x.shape[2]).T).full().reshape(-1, *x.shape[:2])
+        return np.where(np.isfinite(h), h, np.inf).min(axis=2, initial=np.inf).T
+
+    def violation(self, least: Array) -> Array:
+        """The largest violation of a path constraint as a share of its scale [B], of least values [B, m]; 0: none."""
+        return np.asarray((-least / self.constraint_scales).max(axis=1, initial=0.0)) + 0.0
 
     @property
     def L_soft(self) -> ca.Function:

@@ -224,7 +224,9 @@ class Search:
 
     def solution(self) -> Solution:
         """The best of each state; seconds, iterations and `tried` are of all starts."""
-        return replace(self.best, seconds=self.seconds, iterations=self.iterations, tried=self._tried())
+        clearance = self.ocp.least(self.best.x).min(axis=1, initial=np.inf)
+        return replace(self.best, clearance=clearance, seconds=self.seconds, iterations=self.iterations,
+                       tried=self._tried())
 
 
 def spread(ocp: OCP, x: Array) -> Array:

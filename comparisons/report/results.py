@@ -28,7 +28,7 @@ from nocl.ocp import OCP
 from nocl.support.checks import Array
 
 REFERENCE = "reference"  # the name of a yardstick among the methods: its speed is no method's
-VIOLATION = 1e-3  # a path constraint below minus this, in its own unit, is violated
+VIOLATION = 1e-3  # a path constraint below minus this share of its own scale is violated
 WIDTH = 118  # characters of a line in the terminal
 Mask = NDArray[np.bool_]
 
@@ -60,7 +60,7 @@ class Judged:
     @property
     def feasible(self) -> Mask:
         """[B], whether the run reached the horizon with all path constraints held."""
-        return np.asarray(self.simulation.success, dtype=bool) & ~(self.simulation.clearance < -VIOLATION)
+        return np.asarray(self.simulation.success, dtype=bool) & ~(self.simulation.violation > VIOLATION)
 
 
 class Summary(list[Row]):

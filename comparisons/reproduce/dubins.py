@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from nocl.comparisons.report.results import VIOLATION
 from nocl.comparisons.reproduce import table
 from nocl.comparisons.reproduce.table import Place, grid, small
 from nocl.judge import Simulation, simulate
@@ -37,6 +36,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TOLERANCE = 0.1
+VIOLATION = 1e-3  # m, that a run may cut into the obstacle
 INTERVALS = 80
 NODES = 401  # at which continuous feedback is recorded, to measure lengths
 DRAWN = 12  # trajectories that a cell keeps for the figure
@@ -80,7 +80,7 @@ class Cell:
 
     @property
     def success(self) -> Array:
-        return (np.asarray(self.error) <= TOLERANCE) & (np.asarray(self.clearance) >= -VIOLATION)
+        return np.asarray((np.asarray(self.error) <= TOLERANCE) & (np.asarray(self.clearance) >= -VIOLATION))
 
 
 def judged(ocp: OCP, controller: Any, x0: Array) -> tuple[Simulation, Array]:

@@ -22,7 +22,9 @@ import numpy as np
 from nocl import __version__
 from nocl.comparisons.disturbances import mass_variants
 from nocl.comparisons.methods import is_plan, own_rate
+from nocl.comparisons.report.results import count
 from nocl.comparisons.studies import study
+from nocl.data import TINY
 from nocl.exports.bundle import export
 from nocl.judge import simulate
 from nocl.ocp import OCP
@@ -38,6 +40,8 @@ from nocl.sysid.logs.log import Log
 
 PARTS = ("dynamics", "cnd", "export", "report", "checkpoint")  # folders in a run's folder
 KEY = "run"  # of a card: what the stage was made from
+COARSE = 0.01  # of a cost: where judge and plan differ by more, the plan's grid is too coarse
+JUDGED = 64  # plans of `nocl solve` that are run on the exact f
 OF_LOGS = ("data", "known", "control_affine", "hold_controls")  # of that, what dynamics of a log have more
 
 
@@ -220,21 +224,52 @@ def load_run(folder: Path) -> CND:
 def solve(ocp: OCP, out: Path, name: str, n: int, seed: int, intervals: int, workers: int | str = "auto") -> None:
     """Solve n initial states by one method, and write OUT/NAME.npz (arrays), .json (messages) and a line of summary.
 
-    Feedback is simulated. What is solved is kept in OUT/checkpoint until all is: the same call goes on from there.
+    Feedback is simulated; plans are judged, run in open loop on the exact f, the first JUDGED of them. What is solved
+    is kept in OUT/checkpoint until all is: the same call goes on from there.
     """
     options, x0 = registry.Options(intervals, seed), fresh_states(ocp, n, seed)
     start, checkpoint = time.perf_counter(), out / "checkpoint" / _solve_key(ocp, name, n, seed, intervals)
     method = registry.METHODS[name].build(ocp, options)
     planned = is_plan(method)
     s, arrays, facts = _solved(method, x0, workers, checkpoint) if planned else _simulated(ocp, method, x0)
-    path = _write_arrays(out / f"{name}.npz", {"x0": x0, **arrays})
+    judged = _judged(ocp, x0, arrays) if planned else {}
+    path = _write_arrays(out / f"{name}.npz", {"x0": x0, **arrays, **judged})
     store.write_json(out / f"{name}.json", {"solver": name, "n": n, "seed": fresh_seed(seed), **facts,
                                             "message": list(s.message)})
     _forget(checkpoint)
     ok = arrays["success"]
     mean = f", mean cost {arrays['cost'][ok].mean():.4g}" if ok.any() else ""
     say(f"{name}: {ok.sum()} of {n} {'solved' if planned else 'simulated'}{mean}, {time.perf_counter() - start:.1f} s; "
-        f"drawn with seed {fresh_seed(seed)}\n{path}")
+        f"drawn with seed {fresh_seed(seed)}\n{_verdict(ocp, arrays, judged, s.message)}{path}")
+
+
+def _judged(ocp: OCP, x0: Array, arrays: dict[str, Any]) -> dict[str, Any]:
+    """Cost and clearance of plans on the exact f, of the first JUDGED that were solved; NaN of the others."""
+    rows, n = np.flatnonzero(arrays["success"])[:JUDGED], len(x0)
+    cost, clearance = np.full(n, np.nan), np.full(n, np.nan)
+    if len(rows):
+        s = simulate(ocp, arrays["u"][rows], x0[rows])
+        cost[rows], clearance[rows] = s.cost, s.clearance
+    return {"judged_cost": cost, "judged_clearance": clearance}
+
+
+def _verdict(ocp: OCP, arrays: dict[str, Any], judged: dict[str, Any], message: Sequence[str]) -> str:
+    """What the judge found beside what the plans predict, and what failed first, in lines."""
+    said, failed = [], np.flatnonzero(~arrays["success"])
+    rows = np.flatnonzero(~np.isnan(judged.get("judged_cost", np.zeros(0))))
+    if len(rows):
+        cost, clear = judged["judged_cost"][rows], judged["judged_clearance"][rows]
+        clearance = f"; least clearance {clear.min():.3g}" if ocp.path_constraints else ""
+        said.append(f"judged in open loop on the exact f, {count(len(rows), 'plan')}: mean cost {cost.mean():.4g}, "
+                    f"predicted {arrays['cost'][rows].mean():.4g}{clearance}")
+        off = np.abs(cost - arrays["cost"][rows]) > COARSE * np.abs(arrays["cost"][rows]) + TINY
+        if off.any():
+            said.append(f"{off.sum()} of {len(rows)} differ by more than {100 * COARSE:g} %: the grid of "
+                        f"{count(arrays['u'].shape[1], 'interval')} is too coarse there, or the plan is unstable in "
+                        "open loop: give more --intervals")
+    if len(failed) and judged:
+        said.append(f"state {failed[0]}: {message[failed[0]]}")
+    return "".join(f"{line}\n" for line in said)
 
 
 def _simulated(ocp: OCP, method: Any, x0: Array) -> tuple[Any, dict[str, Any], dict[str, Any]]:
@@ -248,7 +283,8 @@ def _solved(method: Any, x0: Array, workers: int | str,
     """(solution, its arrays, how sure each optimum is)."""
     given, takes = {"workers": workers, "out": checkpoint}, signature(method.solve).parameters
     s = method.solve(x0, **{key: value for key, value in given.items() if key in takes})
-    arrays = {"t": s.t, "x": s.x, "u": s.u, "cost": s.cost, "success": s.success, "costate": s.costate}
+    arrays = {"t": s.t, "x": s.x, "u": s.u, "cost": s.cost, "success": s.success, "costate": s.costate,
+              "clearance": np.full(len(x0), np.nan) if s.clearance is None else s.clearance}
     return s, arrays, {"starts": s.starts, "hits": s.hits, "optima": [len(o) for o in s.optima]}
 
 

@@ -129,8 +129,8 @@ class Training:
         self.ocp, self.settings, self.seed = ocp, settings, seed
         self.learned = dynamics is not None
         self.f = to_torch(ocp.functions.f) if dynamics is None else dynamics
-        self.ddp = DDP(ocp, intervals=settings.intervals, dynamics=dynamics)
-        self.fine = DDP(ocp, intervals=4 * settings.intervals, dynamics=dynamics)
+        self.ddp = DDP(ocp, intervals=settings.intervals, dynamics=dynamics, constraints="soft")
+        self.fine = DDP(ocp, intervals=4 * settings.intervals, dynamics=dynamics, constraints="soft")
         self.checkpoint = None if out is None else Path(out) / CHECKPOINT
         self.hidden_progress = None if progress is None else not progress
         self.round, self.seconds, self.fitting, self.fitting_cpu, self.evaluations = 0, 0.0, 0.0, 0.0, 0

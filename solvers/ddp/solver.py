@@ -14,6 +14,7 @@ import os
 import sys
 import time
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from importlib.metadata import version
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from nocl.sysid.identification import LearnedDynamics
 
 STAGES = 4  # evaluations of f in an RK4 step
+TOLERATED = 0.01  # of a path constraint's scale: what the penalty may leave of a violation
 GROWTH, DECAY = 4.0, 2.0  # of mu, after a failure and a success: against 8 and 8, twice as many wild starts converge
 
 
@@ -68,6 +70,9 @@ class DDP:
         K, the number of RK4 steps and held controls on [t0, T].
     dynamics : LearnedDynamics, optional
         f_theta in place of the exact f; its networks' derivatives are generated C too.
+    constraints : "hard" or "soft"
+        Path constraints enter the descent by the OCP's penalty. "hard": a solution that violates one at a node by more
+        than 1 % of its scale (OCP.constraint_scales) has success False, and says which; "soft": that is not asked.
     threads : int, optional
         Default: all cores.
     cache : folder for compiled kernels, optional
@@ -75,13 +80,16 @@ class DDP:
     """
 
     def __init__(self, ocp: OCP, *, intervals: int = 80, dynamics: LearnedDynamics | None = None,
-                 settings: DDPSettings | None = None, threads: int | None = None,
+                 settings: DDPSettings | None = None, constraints: str = "hard", threads: int | None = None,
                  cache: str | os.PathLike[str] | None = None) -> None:
         checks.problem(ocp, "DDP")
         for name, value in (("intervals", intervals), ("threads", 1 if threads is None else threads)):
             if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
                 raise ValueError(f"DDP: {name} is {value!r}; expected an integer >= 1")
+        if constraints not in ("hard", "soft"):
+            raise ValueError(f"DDP: constraints is {constraints!r}; expected 'hard' or 'soft'")
         self.ocp, self.intervals, self.settings = ocp, int(intervals), settings or DDPSettings()
+        self.constraints = constraints
         self.threads = int(threads or os.cpu_count() or 1)
         self.dynamics, self.cache = dynamics, cache
         self.evaluations: Counter[str] = Counter()  # of f in this process, one for each state: "rollout", "backward"
@@ -92,7 +100,7 @@ class DDP:
 
     def __getstate__(self) -> dict[str, Any]:
         return {"ocp": self.ocp, "intervals": self.intervals, "dynamics": self.dynamics, "settings": self.settings,
-                "threads": self.threads, "cache": self.cache}
+                "constraints": self.constraints, "threads": self.threads, "cache": self.cache}
 
     def __setstate__(self, options: dict[str, Any]) -> None:
         DDP.__init__(self, **options)  # the kernel is built, or found in the cache, where it is needed
@@ -174,7 +182,7 @@ class DDP:
         """A fingerprint of the problem, the model and the settings."""
         net = None if self.dynamics is None else self.dynamics.net
         return fingerprint(self.ocp.to_data(), ddp_source(self.ocp, net), self._weights,
-                           self.intervals, self.settings, version("nocl"))
+                           self.intervals, self.settings, self.constraints, version("nocl"))
 
     def _run_key(self, x0: Array, t0: Array, guess: dict[str, Array], curvature: bool) -> str:
         """A fingerprint of all that the solution depends on."""
@@ -226,7 +234,7 @@ class Work:
         d = self.ddp
         d.evaluations["rollout"] += STAGES * d.intervals * len(rows)
         d.kernel("nocl_rollout", rows, d.intervals, d._weights, d._lb, d._ub, self.h, self.x0, x_bar, u_bar, self.k,
-                  gain, self.alpha, self.new_x, self.new_u, self.new_J, threads=d.threads)
+                 gain, self.alpha, self.new_x, self.new_u, self.new_J, threads=d.threads)
 
     def backward(self, rows: Rows, V: Array | None = None, V_x: Array | None = None,
                   V_xx: Array | None = None) -> None:
@@ -302,17 +310,36 @@ class Work:
         V_xx = np.zeros((B, K + 1, nx, nx)) if curvature else None
         self.mu[:] = 0
         self.backward(np.arange(B), V, V_x, V_xx)
-        success = self.state == CONVERGED
         t = self.t0[:, None] + self.h[:, None] * np.arange(K + 1)
+        message = np.array([MESSAGES[state] for state in self.state], dtype=object)
+        for i, why in self._violations(t):
+            self.state[i], message[i] = VIOLATED, why
+        success = self.state == CONVERGED
         seconds = np.full(B, (time.perf_counter() - self.begin) / max(B, 1))
+        clearance = self.ddp.ocp.least(self.x).min(axis=1, initial=np.inf)
         return Solution(t, self.x, self.u, self.gain, V, V_x, np.where(success, self.J, np.inf), success,
-                        np.array(MESSAGES)[self.state], seconds, self.iterations, V_xx)
+                        message.astype(np.str_), seconds, self.iterations, V_xx, clearance=clearance)
+
+    def _violations(self, t: Array) -> Iterator[tuple[int, str]]:
+        """Rows that converged, but across a path constraint, and in words which, where and when."""
+        ocp = self.ddp.ocp
+        if self.ddp.constraints == "soft" or not ocp.path_constraints:
+            return
+        over = ocp.violation(ocp.least(self.x)) > TOLERATED
+        for i in np.flatnonzero((self.state == CONVERGED) & over):
+            h = ocp.h(self.x[i].T).full()
+            k, node = np.unravel_index(np.argmin(h / ocp.constraint_scales[:, None]), h.shape)
+            why = "by the initial state itself: move it" if node == 0 else CROSSED
+            yield int(i), (f"path constraint {list(ocp.path_constraints)[k]!r} is violated by {-h[k, node]:.3g} at "
+                           f"node {node}, t = {t[i, node]:.4g}, {why}")
 
 
 MESSAGES = ("running", "converged", "stopped at max_iterations", "no descent: the largest damping did not help",
             "the starting guess blows up: its cost is not finite",
-            "stationary, but no minimum: the cost is not convex in the controls there")
-RUNNING, CONVERGED, OUT_OF_ITERATIONS, NO_DESCENT, BLEW_UP, NOT_CONVEX = range(6)
+            "stationary, but no minimum: the cost is not convex in the controls there", "a path constraint is violated")
+CROSSED = ("which the penalty does not hold: raise the OCP's penalty, or ask NMPC, which tells whether any control "
+           "holds it")
+RUNNING, CONVERGED, OUT_OF_ITERATIONS, NO_DESCENT, BLEW_UP, NOT_CONVEX, VIOLATED = range(7)
 
 
 def _fitting(ocp: OCP, dynamics: LearnedDynamics) -> Any:

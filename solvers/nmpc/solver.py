@@ -284,7 +284,7 @@ class _States:
         self.nmpc, self.x0, self.t, self.given, self.warm = nmpc, x0, t, given, warm
         self.pool, self.journal, self.show = pool, journal, show
         self.refusal = [violated_start(nmpc.program, x) for x in x0]
-        self.failed: list[Answer | None] = [None] * len(x0)  # the most feasible of each state's solves that failed
+        self.failed: list[Answer | None] = [None] * len(x0)  # of each state's solves that failed, by rank
 
     def begin(self, stage: int, what: str) -> None:
         self.number, self.what = stage - 1, what
@@ -310,7 +310,7 @@ class _States:
         outcomes = do(_Job(self.nmpc), tasks, self.pool, self.journal, self.show, self.what)
         for outcome in outcomes:
             best, failed = self.failed[outcome.row], outcome.failed
-            if failed is not None and (best is None or failed.violation < best.violation):
+            if failed is not None and (best is None or failed.rank < best.rank):
                 self.failed[outcome.row] = failed
         yield np.array([o.row for o in outcomes], dtype=np.int64), solved_by(self.nmpc.ocp, self.t, outcomes)
 

@@ -48,7 +48,7 @@ class Outcome:
     seconds: float
     iterations: int
     best: Answer | None
-    failed: Answer | None  # the most feasible of the solves that failed
+    failed: Answer | None  # of the solves that failed the one that tells most: Answer.rank
     size: int = 1
 
     def arrays(self) -> dict[str, Any]:
@@ -77,7 +77,7 @@ def attempt(program: Transcription, task: Task, guesses: Sequence[Guess]) -> Out
     good, bad = ([a for a in answers if bool(a.success) is ok] for ok in (True, False))
     return Outcome(task.name, task.row, np.array([a.cost for a in answers]), seconds,
                    sum(a.iterations for a in answers), min(good, key=lambda a: a.cost, default=None),
-                   min(bad, key=lambda a: a.violation, default=None))
+                   min(bad, key=lambda a: a.rank, default=None))
 
 
 def _second_opinion(program: Transcription, task: Task, answers: Sequence[Answer]) -> list[Answer]:

@@ -64,6 +64,12 @@ class Answer:
     outcome: str  # how it ended: a key of OUTCOMES, GIVEN_UP, or CasADi's own name
 
 
+    @property
+    def rank(self) -> tuple[bool, float]:
+        """Of failures: the one that says that there is no solution comes first, then the most feasible."""
+        return self.outcome != INFEASIBLE, self.violation
+
+
 @dataclass(frozen=True, eq=False)
 class Transcription:
     """The program of an OCP under dynamics f on N intervals; built when first used, so that settings travel alone."""
