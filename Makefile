@@ -20,11 +20,12 @@ PIP := $(BIN)/python -m pip install --quiet --no-compile# saves half a minute: m
 demo: set-up
 	$(BIN)/nocl run cartpole --out runs/cartpole
 
+# One thread of torch in each of the processes: threads of several get in each other's way, and take half again as long.
 test: lint
-	$(BIN)/python -m pytest -n auto -m "not slow"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "not slow"
 
 test-slow: lint
-	$(BIN)/python -m pytest -n auto -m "not mission"
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "not mission"
 
 mission: set-up
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadgroup tests/mission

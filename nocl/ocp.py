@@ -237,7 +237,7 @@ class OCP:
 
     def least(self, x: Array) -> Array:
         """The least value [B, number of them] of each path constraint along states x [B, n, nx]; inf for NaN."""
-        h = self.h(x.reshape(-1, x.shape[2]).T).full().reshape(-1, *x.shape[:2])
+        h = self.h(x.reshape(-1, x.shape[2]).T).full().reshape(len(self.path_constraints), *x.shape[:2])
         return np.where(np.isfinite(h), h, np.inf).min(axis=2, initial=np.inf).T
 
     def violation(self, least: Array) -> Array:

@@ -255,6 +255,7 @@ def small(monkeypatch):
 RUN = ["run", "cubic.py", "--out", "out", "--quick", "--n", "2", "--intervals", "10"]
 
 
+@pytest.mark.slow
 def test_a_run_from_a_users_file_to_its_report(here, capsys, monkeypatch):
     small(monkeypatch)
     assert main(RUN) == 0

@@ -59,6 +59,7 @@ def test_outside_the_box_there_is_no_answer(integrator):
     assert "NaN" in run.message[1]
 
 
+@pytest.mark.slow
 def test_refinement_converges_to_the_riccati_value():
     ocp, x = nocl.load_ocp("double_integrator"), states()
     study = refine(ocp, [(31, 31), (61, 61), (91, 91)], x)
@@ -171,6 +172,7 @@ def test_the_upwind_hamiltonian_holds_a_drifting_state_still_in_a_fold_of_v():
         np.testing.assert_allclose(H, best, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_stretching_helps_where_the_goal_is_small():
     """van der Pol's V against the optimum of DDP: 4 % off where it is 8 % on uniform axes."""
     from nocl.solvers.ddp.solver import DDP

@@ -212,6 +212,7 @@ def judged(ocp, policy, n=20):
                     ocp.initial_states.sample(n, 77))
 
 
+@pytest.mark.slow
 def test_double_integrator_reaches_the_cost_of_lqr():
     ocp = double_integrator.ocp()
     policy, *_ = train(ocp, time_input=True, hold=True, intervals=20, iterations=300, batch=32, race=1,

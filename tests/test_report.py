@@ -114,6 +114,7 @@ def test_the_summary_comes_back_from_json(report, folder):
     assert {"nocl", "casadi", "numpy"} <= set(data["versions"])
 
 
+@pytest.mark.slow
 def test_a_report_is_replaced_and_foreign_files_stay(report, tmp_path):
     report.save(tmp_path)
     (tmp_path / "notes.txt").write_text("mine")

@@ -138,6 +138,7 @@ def test_plans_are_checked():
         approaches.TABLE.places(approaches.Plan(problems=("boat",)))
 
 
+@pytest.mark.slow
 def test_approaches_level_sets_end_where_memory_does(tmp_path):
     pytest.importorskip("hj_reachability")
     plan = approaches.Plan(nodes=11, states=8, problems=("double_integrator", "quadrotor"))
