@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -24,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nocl.ocp import OCP
+from nocl.smoothness import kinks
 from nocl.support import checks, interrupt
 from nocl.support.checks import Array
 
@@ -219,6 +221,23 @@ class _Judge:
         self.options = {"reltol": rtol, "abstol": atol, "quad_err_con": True, "disable_internal_warnings": True,
                         "show_eval_warnings": False, "max_num_steps": 20000}
 
+    @cached_property
+    def jumps(self) -> str:
+        """Where f jumps in X x U, in words; "" where it does not, or is not written out."""
+        s = self.ocp.system
+        if s.xdot is None or self.f is not self.ocp.functions.f:
+            return ""
+        z, box = ca.vertcat(s.x, s.u), (np.r_[s.lbx, s.lbu], np.r_[s.ubx, s.ubu])
+        found = [kink for row in ca.vertsplit(s.xdot) for kink in kinks(row, z, *box)]
+        return ", ".join(dict.fromkeys(f"{kink.where} = 0" for kink in found if kink.what == "jump"))
+
+    def blow_up(self, t: float, x: Array, until: float, what: str = "the state blows up") -> str:
+        """Why CVODES did not get from x at t to `until`: beside a jump of f a state that stays in X did not blow up."""
+        s = self.ocp.system
+        if self.jumps and (np.abs(x - (s.lbx + s.ubx) / 2) <= s.ubx - s.lbx).all():
+            what = f"the integrator gave up, chattering where f jumps ({self.jumps}; try tanh(e / width) for sign(e)),"
+        return _failure(what, t, x, until)
+
     def integrator(self, dae: dict[str, Any], grid: Array, method: str) -> ca.Function:
         """From 0 to the times in `grid`."""
         options: dict[str, Any] = {**self.options, "linear_multistep_method": method}
@@ -344,7 +363,7 @@ class _Segment:
             ends = (_integrate(step, z, [a, b - a])[0] for step in steps)
             end = next((e for e in ends if e is not None), None)
             if end is None:
-                return path, np.nan, _failure("the state blows up or the control is NaN", a, z[:-1], b)
+                return path, np.nan, self.judge.blow_up(a, z[:-1], float(b), "the state blows up or the control is NaN")
             path[k] = z = end[:, -1]
             a = float(b)
         return path, np.nan, _failure("CVODES did not reach the end", self.a, z[:-1], a)
@@ -354,7 +373,7 @@ class _Step:
     """Held controls over one interval, state by state: a mapped call is a tenth faster, but fails for all at once."""
 
     def __init__(self, judge: _Judge) -> None:
-        dae, self.m = judge.held_dae(), judge.between
+        dae, self.m, self.judge = judge.held_dae(), judge.between, judge
         grid = np.arange(1, self.m + 1) / self.m
         self.solvers = [judge.integrator(dae, grid, method) for method in MULTISTEP]
 
@@ -368,7 +387,7 @@ class _Step:
             ends = (_integrate(solver, z[i], p[i])[0] for solver in self.solvers)
             end = next((e for e in ends if e is not None), None)
             if end is None:
-                message[i] = _failure("the state blows up", a, z[i, :-1], b)
+                message[i] = self.judge.blow_up(a, z[i, :-1], b)
             else:
                 path[i], z[i] = end[:-1].T, end[:, -1]
         return path

@@ -21,6 +21,7 @@ from nocl.support import checks
 from nocl.support.checks import MALFORMED, Array, Vector
 from nocl.system import System
 from nocl.translate import instructions
+from nocl.translate.instructions import check_scalar
 
 KINKS = ("solvers that use second derivatives may fail there; smooth it, nocl.smooth_abs(e, width) or "
          "nocl.smooth_max(a, b, width), or split a control, nocl.split_controls(system, names)")
@@ -127,6 +128,7 @@ class OCP:
         at = np.vstack([x, np.repeat(self.u_goal[:, None], x.shape[1], axis=1)])
         for what, value in [("running", self.running), ("terminal", self.terminal),
                             *((f"path constraint {name!r}", h) for name, h in self.path_constraints.items())]:
+            check_scalar(ca.Function("e", [z], [value]), f"{owner}: {what}")
             hessian, gradient = ca.hessian(value, z)
             for order, e in (("", value), ("the gradient of ", gradient), ("the second derivative of ", hessian)):
                 values = ca.Function("e", [z], [ca.vec(ca.densify(e))])(at).full()

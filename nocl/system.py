@@ -75,6 +75,7 @@ class System:
         if self.xdot is not None:
             z = ca.vertcat(self.x, self.u)
             self._set(xdot=checks.expression(checks.column(self.xdot), self.nx, z, "xdot", owner))
+            instructions.check_scalar(ca.Function("xdot", [z], [self.xdot]), f"{owner}: xdot")
         lbu, ubu = checks.bounds(self.lbu, self.ubu, self.nu, ("lbu", "ubu"), owner, self.control_names)
         lbx, ubx = checks.bounds(self.lbx, self.ubx, self.nx, ("lbx", "ubx"), owner, self.state_names)
         self._set(lbu=lbu, ubu=ubu, lbx=lbx, ubx=ubx)

@@ -100,6 +100,7 @@ def other_pendulum(name="theta", gravity=3.7):
 def test_a_controller_of_another_system_of_the_same_sizes_is_refused(pendulum, change, match):
     cnd, mars = nocl.pretrained("pendulum"), other_pendulum(**change)
     for call in (lambda: nocl.simulate(mars, cnd, [3.0, 0.0]), lambda: NMPC(mars, terminal=cnd).solve([3.0, 0.0]),
+                 lambda: NMPC(mars, 20).solve([3.0, 0.0], cnd, workers=1),
                  lambda: nocl.comparisons.compare(mars, {"CND": cnd}, n=1)):
         with pytest.raises(ValueError, match=match):
             call()

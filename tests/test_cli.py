@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from dataclasses import asdict
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -14,6 +15,7 @@ import pytest
 import nocl
 from nocl.cli import run_folder
 from nocl.cli.commands import main
+from nocl.cli.run_folder import beside
 from nocl.exports import parity
 from nocl.solvers import NMPC
 from nocl.solvers.cnd import CND, TrainSettings
@@ -307,7 +309,10 @@ def test_a_run_from_a_users_file_to_its_report(here, capsys, monkeypatch):
     assert "controller: training on the exact dynamics (what is there was made for another" in out
     assert CND.load(run / "cnd").card["seed"] == 1
 
+    before, changed = tree(run), run.stat().st_mtime_ns
     assert main(["compare", "out", "--n", "2", "--methods", "CND,DDP", "--hold", "20", "--out", "elsewhere"]) == 0
+    assert (tree(run), run.stat().st_mtime_ns) == (before, changed)  # not even for a while
+    assert not (here / "elsewhere" / "checkpoint").exists()
     out = capsys.readouterr().out
     assert "CND (20 holds)" in out
     assert "on 2 initial states, drawn with seed 2" in out  # one more than that of the run
@@ -343,6 +348,26 @@ def test_an_interrupted_run_goes_on_from_the_last_finished_stage(here, capsys, m
     out = capsys.readouterr().out
     assert "controller: taken from out/cnd" in out
     assert (here / "out" / "report" / "report.html").is_file()
+
+
+def test_a_comparison_works_where_its_report_goes(here):
+    assert beside(here / "run" / "report", here / "run") == here / "run"
+    assert beside(Path("run/report"), here / "run") == here / "run"
+    assert beside(here / "running", here / "run") == here / "running"
+
+
+def test_output_that_cannot_be_printed(here):
+    """A full disk and a closed output are one line, or none, and never a traceback."""
+    def listed(redirection):
+        return subprocess.run(f"{sys.executable} -m nocl list {redirection}", shell=True, cwd=here, text=True,
+                              stderr=subprocess.PIPE, check=False)
+
+    full = listed("> /dev/full")
+    assert full.returncode == 2
+    assert full.stderr.startswith("nocl: error: the output: No space left on device; make room")
+    assert full.stderr.count("\n") == 1
+    for fine in (">&-", "| head -n 1 > first"):
+        assert not listed(fine).stderr
 
 
 @pytest.mark.slow

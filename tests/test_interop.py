@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import warnings
+from dataclasses import replace
 from types import SimpleNamespace
 
 import casadi as ca
@@ -49,6 +50,19 @@ def test_gymnasium_accepts_the_environment(problem, integrator):
         warnings.simplefilter("error")
         warnings.filterwarnings("ignore", message=".*(infinity|symmetric and normalized|spec).*")
         check_env(env, skip_render_check=True)
+
+
+@pytest.mark.parametrize(("horizon", "steps"), [(0.1, 3), (0.7, 7), (2.3, 23), (1 / 3, 49)])
+def test_observed_times_lie_in_their_space(ocp, horizon, steps):
+    """0.1 / 3 * 3 is a digit above 0.1."""
+    pytest.importorskip("gymnasium")
+    env = nocl.to_gymnasium(replace(ocp, horizon=horizon), steps=steps)
+    observation, _ = env.reset(seed=0)
+    for _ in range(steps):
+        assert env.observation_space.contains(observation)
+        observation, *_ = env.step([0.0])
+    assert env.observation_space.contains(observation)
+    assert observation[-1] == horizon
 
 
 @pytest.mark.parametrize("integrator", ["rk4", "cvodes"])

@@ -268,3 +268,16 @@ def test_a_delay_that_cannot_be_is_refused():
         simulate(ocp, lambda x, t: np.zeros((len(x), 1)), [0.0, 0.0], hold=4, delay=0.6)
     with pytest.raises(ValueError, match="give `hold`"):
         simulate(ocp, LQR(ocp), [0.0, 0.0], delay=0.1)
+
+
+@pytest.mark.parametrize("control", [np.zeros((1, 4, 1)), lambda x, t: 0 * x])
+def test_chattering_is_no_blow_up(control):
+    """x' = -sign(x) + u reaches 0 at t = 1 and stays: CVODES gives up there, and the state is where it should be."""
+    s, u = ca.SX.sym("s"), ca.SX.sym("u")
+    system = nocl.System("sliding", x=s, u=u, xdot=-ca.sign(s) + u, lbu=[-0.5], ubu=[0.5], lbx=[-2], ubx=[2])
+    ocp = nocl.OCP(system, horizon=2.0, running=u**2 + s**2, terminal=s**2, x_goal=[0], u_goal=[0],
+                   initial_states=nocl.Gaussian(mean=[1.0], std=[0.1]))
+    run = nocl.simulate(ocp, control, [1.0])
+    assert not run.success[0]
+    assert "the integrator gave up, chattering where f jumps (s = 0;" in run.message[0]
+    assert "blows up" not in run.message[0]

@@ -254,3 +254,22 @@ def test_the_printed_text_means_the_expression(expression):
     (a_ + -3 * b_, "a - 3 b"), (ca.if_else(a_ > b_, a_, 0), "(a if b < a else 0)"), (2 * a_, "2 a")])
 def test_notation(expression, text):
     assert pretty.lines(expression, ca.vertcat(a_, b_, c_))[0] == [text]
+
+
+@pytest.mark.parametrize("kind", ["linear", "bspline"])
+def test_table_look_ups_are_refused_at_once(kind):
+    """As f, in equations and in costs: nothing can translate them, nor differentiate them as SX."""
+    knots = np.linspace(-2, 2, 9)
+    table = ca.interpolant("table", kind, [knots], np.sin(knots))
+    x, u = ca.MX.sym("x", 2), ca.MX.sym("u")
+    f = ca.Function("f", [x, u], [ca.vertcat(x[1], u + table(x[0]))])
+    box = {"lbu": [-1], "ubu": [1], "lbx": [-2, -2], "ubx": [2, 2]}
+    with pytest.raises(ValueError, match=r"(table look-up|SX)"):
+        nocl.System.from_casadi(f, **box)
+    p, v, a = ca.SX.sym("p"), ca.SX.sym("v"), ca.SX.sym("a")
+    with pytest.raises(ValueError, match="xdot contains OP_CALL"):
+        nocl.System("table", x=ca.vertcat(p, v), u=a, xdot=ca.vertcat(v, a + table(p)), **box)
+    plain = nocl.System("plain", x=ca.vertcat(p, v), u=a, xdot=ca.vertcat(v, a), **box)
+    with pytest.raises(ValueError, match="running contains OP_CALL"):
+        nocl.OCP(plain, horizon=1.0, running=a**2 + table(p), terminal=p**2, x_goal=[0, 0], u_goal=[0],
+                 initial_states=nocl.Gaussian([1, 0], [0.1, 0.1]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import sys
 import traceback
@@ -24,6 +25,9 @@ if TYPE_CHECKING:
 QUICK_PROOF = ("casadi", "onnx", "c")  # of a run: L4CasADi takes half a minute to build
 SEED = ("of all that is drawn; the initial states that methods are run from are drawn with one more, "
         "so that they are not those of training")
+REMEDIES = {errno.ENOSPC: "make room there, and the same command goes on from the last finished step",
+            errno.EROFS: "name another --out", errno.EACCES: "name another --out, or one that is yours",
+            errno.ENOENT: "name one that is there"}
 INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 
 
@@ -33,19 +37,27 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         args = parser().parse_args(words)
         args.command(args)
-        sys.stdout.flush()
+        if sys.stdout is not None:
+            sys.stdout.flush()
     except KeyboardInterrupt:
         print("\nnocl: interrupted; the same command goes on from the last finished step", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:  # `nocl list | head`
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _give_up_output()
         return 0
     except Exception as error:  # the command line is where all errors end
         if "--debug" in words:
             traceback.print_exc()
         print(f"nocl: error: {_one_line(error)}", file=sys.stderr)
+        if isinstance(error, OSError):  # what could not be printed would be tried again at the end
+            _give_up_output()
         return 2
     return 0
+
+
+def _give_up_output() -> None:
+    if sys.stdout is not None:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def _one_line(error: Exception) -> str:
@@ -55,7 +67,8 @@ def _one_line(error: Exception) -> str:
     if isinstance(error, ImportError):
         return f"{text}: install it, or leave out what needs it"
     if isinstance(error, OSError):
-        return f"{error.filename or ''}: {error.strerror or text}".removeprefix(": ")
+        remedy = REMEDIES.get(error.errno or 0, "see to it, and the same command goes on from the last finished step")
+        return f"{error.filename or 'the output'}: {error.strerror or text}; {remedy}"
     return f"unexpected {type(error).__name__}: {text or 'no message'} (--debug shows where)"
 
 
@@ -238,7 +251,7 @@ def _export(args: argparse.Namespace) -> None:
 
 
 def _compare(args: argparse.Namespace) -> None:
-    from nocl.cli.run_folder import RunFolder, load_run  # torch
+    from nocl.cli.run_folder import RunFolder, beside, load_run  # torch
 
     run = args.run
     cnd = load_run(run)
@@ -246,7 +259,7 @@ def _compare(args: argparse.Namespace) -> None:
     arguments.check_out(out)
     seed = int(cnd.card.get("seed", 0)) if args.seed is None else args.seed
     _refuse(cnd.ocp, args.methods, registry.Options(args.intervals, seed))
-    with alone(run):  # where outcomes so far are kept
+    with alone(beside(out, run)):  # where outcomes so far are kept
         RunFolder(cnd.ocp, run, seed).compare(cnd, out, args.methods, args.n, args.intervals, args.hold, args.robust)
 
 

@@ -142,8 +142,9 @@ class RunFolder:
         say(f"comparing {titles} on {n} initial states, drawn with seed {fresh_seed(self.seed)}, on the exact dynamics")
         chosen = {entry.title: entry.build(self.ocp, options) if entry.make else cnd for entry in entries}
         model = self._dynamics_there() if cnd.card.get("dynamics") == "learned" else None
-        checkpoint = self._checkpoint(methods=list(methods), n=n, intervals=intervals, hold=str(hold), robust=robust,
-                                      controller=fingerprint(cnd.to_casadi()))
+        checkpoint = self._checkpoint(
+            beside(out, self.folder), methods=list(methods), n=n, intervals=intervals, hold=str(hold), robust=robust,
+            controller=fingerprint(cnd.to_casadi()))
         report = study(self.ocp, chosen, n=n, seed=fresh_seed(self.seed), hold=hold, model=model, robust=robust,
                        variants=mass_variants(self.ocp) if robust else None, out=checkpoint)
         path = report.save(out)
@@ -154,10 +155,10 @@ class RunFolder:
         problem = sha256(json_text(self.ocp.to_data()))  # as the cards of earlier runs have it
         return {"problem": problem, "seed": self.seed, "effort": self.effort, **settings}
 
-    def _checkpoint(self, **settings: Any) -> Path:
+    def _checkpoint(self, folder: Path, **settings: Any) -> Path:
         """Where outcomes so far are kept while a comparison lasts: another one goes elsewhere."""
         key = fingerprint(self._made_from(**settings), __version__, version("casadi"))
-        return self.folder / "checkpoint" / f"compare-{key[:12]}"
+        return folder / "checkpoint" / f"compare-{key[:12]}"
 
     def _dynamics_there(self) -> LearnedDynamics | None:
         folder = self.folder / "dynamics"
@@ -190,6 +191,11 @@ def _of_a_log(model: LearnedDynamics, made_from: dict[str, Any]) -> bool:
 def _anew(there: Any) -> str:
     """Why something that stands there is made again."""
     return "" if there is None else " (what is there was made for another problem, seed or setting)"
+
+
+def beside(out: Path, run: Path) -> Path:
+    """The folder that a comparison works in: the run's where its report goes there, else that of the report."""
+    return run if out.absolute().is_relative_to(run.absolute()) else out
 
 
 def _forget(checkpoint: Path) -> None:

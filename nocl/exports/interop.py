@@ -141,7 +141,8 @@ def _environment(gymnasium: Any, ocp: OCP, steps: int, step: Callable[[Array, Ar
             return self._observation(), -cost, self.k == steps, False, self._info()
 
         def _observation(self) -> Array:
-            return np.r_[self.x, self.k * ocp.horizon / steps] if observe_time else self.x.copy()
+            time = min(self.k * ocp.horizon / steps, ocp.horizon)  # not the last digit above it
+            return np.r_[self.x, time] if observe_time else self.x.copy()
 
         def _info(self) -> dict[str, Any]:
             h = ocp.h(self.x).full().ravel()

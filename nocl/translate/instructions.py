@@ -59,15 +59,21 @@ def to_data(function: ca.Function) -> dict[str, Any]:
     Raises ValueError for a function that is not made of operations on scalars.
     """
     function = expand(function)
-    for i in instructions(function):
-        if i.op not in UNARY | BINARY | {"OP_INPUT", "OP_CONST", "OP_OUTPUT"}:
-            raise ValueError(f"{function.name()} contains {i.op}, expected operations on scalars only: "
-                             "replace calls of other functions (table look-ups, never_inline) in it")
+    check_scalar(function, function.name())
     code = [[i.op, *i.out, *i.args] if i.op != "OP_CONST" else [i.op, *i.out, float(i.value).hex()]
             for i in instructions(function)]
     return {"name": function.name(), "work": function.sz_w(), "code": code,
             "inputs": [[function.name_in(i), *function.size_in(i)] for i in range(function.n_in())],
             "outputs": [[function.name_out(i), *function.size_out(i)] for i in range(function.n_out())]}
+
+
+def check_scalar(function: ca.Function, owner: str) -> None:
+    """ValueError where an SX function calls others: these cannot be translated, nor differentiated as SX."""
+    for i in instructions(function):
+        if i.op not in UNARY | BINARY | {"OP_INPUT", "OP_CONST", "OP_OUTPUT"}:
+            raise ValueError(f"{owner} contains {i.op}, a call of another function, expected operations on scalars "
+                             "only: put a polynomial, a sum of smooth bumps or a small network in place of a table "
+                             "look-up, and inline what is marked never_inline")
 
 
 def from_data(data: Mapping[str, Any], inputs: list[ca.SX] | None = None) -> ca.Function:

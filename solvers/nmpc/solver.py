@@ -334,6 +334,7 @@ def _is_solution(guess: Any) -> bool:
 def _given(guess: Any, nmpc: NMPC, x0: Array, t: Array) -> list[Guess]:
     """A user's guess, checked: states and controls for each x0."""
     s, N, B = nmpc.ocp.system, nmpc.intervals, len(x0)
+    check_made_for(nmpc.ocp, guess, "NMPC: the guess")
     if callable(guess) and not isinstance(guess, Solution):
         return [starting.controller_rollout(nmpc.program, guess, row, t) for row in x0]
     x, u = (guess.x, guess.u) if hasattr(guess, "x") and hasattr(guess, "u") else \
