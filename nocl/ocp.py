@@ -82,7 +82,7 @@ class OCP:
         self._check_initial_states(owner)
         self._check_finite(owner)
         if self.kinks:
-            warnings.warn(f"{owner}: {'; '.join(self.kinks)}: {KINKS}", UserWarning, stacklevel=3)
+            warnings.warn(f"{owner}: {self.not_smooth}", UserWarning, stacklevel=3)
 
     def _set(self, **values: object) -> None:
         for key, value in values.items():
@@ -146,6 +146,11 @@ class OCP:
         parts = {"the running cost": self.running, "the terminal cost": self.terminal,
                  **{f"path constraint {name!r}": h for name, h in self.path_constraints.items()}}
         return tuple(f"{what} has {kink}" for what, e in parts.items() for kink in kinks(e, z, lower, upper))
+
+    @property
+    def not_smooth(self) -> str:
+        """The kinks and what to do about them, as one sentence; "" where there are none."""
+        return f"{'; '.join(self.kinks)}: {KINKS}" if self.kinks else ""
 
     @cached_property
     def periodic(self) -> tuple[int, ...]:

@@ -7,6 +7,8 @@ import pytest
 
 import nocl
 from nocl.smoothness import kinks, linear_controls
+from nocl.solvers import DDP, NMPC
+from nocl.solvers.ddp.solver import DDPSettings
 
 p, v, u = z_parts = [ca.SX.sym(name) for name in ("p", "v", "u")]
 z = ca.vertcat(*z_parts)
@@ -90,3 +92,19 @@ def test_coupled_controls_are_not_linear():
 def test_training_refuses_a_linear_cost_at_the_start():
     with pytest.raises(ValueError, match=r"linear in u.*bang-bang.*small quadratic term"):
         nocl.train(problem(p**2 + u))
+
+
+def test_solvers_that_fail_at_a_kink_say_so():
+    """They had advised more iterations, which cannot help."""
+    p, v, u = ca.SX.sym("p"), ca.SX.sym("v"), ca.SX.sym("u")
+    system = nocl.System("mass", x=ca.vertcat(p, v), u=u, xdot=ca.vertcat(v, u), lbu=[-2], ubu=[2], lbx=[-3, -3],
+                         ubx=[3, 3])
+    with pytest.warns(UserWarning, match="has a kink where p = 0"):
+        ocp = nocl.OCP(system, horizon=3.0, running=0.1 * u**2 + ca.fabs(p), terminal=p**2 + v**2, x_goal=[0, 0],
+                       u_goal=[0], initial_states=nocl.Gaussian([1, 0], [0.1, 0.1]))
+    for solution in (NMPC(ocp, 20, starts=1, passes=0, options={"fatrop.max_iter": 2}).solve([1.0, 0.0], workers=1),
+                     DDP(ocp, intervals=20, settings=DDPSettings(max_iterations=1)).solve([1.0, 0.0])):
+        if not solution.success[0]:
+            assert "the running cost has a kink where p = 0" in solution.message[0]
+            assert "nocl.smooth_abs" in solution.message[0]
+    assert not DDP(ocp, intervals=20, settings=DDPSettings(max_iterations=1)).solve([1.0, 0.0]).success[0]

@@ -311,7 +311,7 @@ class Work:
         self.mu[:] = 0
         self.backward(np.arange(B), V, V_x, V_xx)
         t = self.t0[:, None] + self.h[:, None] * np.arange(K + 1)
-        message = np.array([MESSAGES[state] for state in self.state], dtype=object)
+        message = np.array([self._words(state) for state in self.state], dtype=object)
         for i, why in self._violations(t):
             self.state[i], message[i] = VIOLATED, why
         success = self.state == CONVERGED
@@ -319,6 +319,10 @@ class Work:
         clearance = self.ddp.ocp.least(self.x).min(axis=1, initial=np.inf)
         return Solution(t, self.x, self.u, self.gain, V, V_x, np.where(success, self.J, np.inf), success,
                         message.astype(np.str_), seconds, self.iterations, V_xx, clearance=clearance)
+
+    def _words(self, state: int) -> str:
+        kinks = self.ddp.ocp.not_smooth if state in (OUT_OF_ITERATIONS, NO_DESCENT, NOT_CONVEX) else ""
+        return MESSAGES[state] + (f"; {kinks}" if kinks else "")
 
     def _violations(self, t: Array) -> Iterator[tuple[int, str]]:
         """Rows that converged, but across a path constraint, and in words which, where and when."""

@@ -12,7 +12,7 @@ import numpy as np
 from nocl.data import Solution
 from nocl.ocp import OCP
 from nocl.solvers.nmpc.guesses import Guess
-from nocl.solvers.nmpc.transcription import FEASIBLE, GIVEN_UP, NOT_A_NUMBER, STOPPED, Answer, Transcription
+from nocl.solvers.nmpc.transcription import FEASIBLE, GIVEN_UP, INFEASIBLE, NOT_A_NUMBER, STOPPED, Answer, Transcription
 from nocl.support.checks import Array
 
 
@@ -124,6 +124,8 @@ def failure(program: Transcription, x0: Array, starts: int, failed: Answer | Non
 
 
 def _remedy(outcome: str, program: Transcription) -> str:
+    if program.ocp.kinks and outcome not in (INFEASIBLE, GIVEN_UP):
+        return f"a smooth problem: {program.ocp.not_smooth}"
     if outcome == STOPPED:
         return f"more iterations (options={{'{program.backend}.max_iter': 3000}}), more starts or another guess"
     if outcome == GIVEN_UP:
