@@ -31,14 +31,14 @@ def costs(problem: str, dynamics: str, x0: Array) -> Array:
 
 def searched(problem: str, x0: Array) -> Array:
     """[B], the cost that the global search finds on the usual grid."""
-    return np.asarray(solve_globally(DDP(nocl.load_ocp(problem)), x0, seed=0).best.cost)
+    return np.asarray(solve_globally(DDP(nocl.load_ocp(problem)), x0, seed=0).cost)
 
 
 def optimum(problem: str, x0: Array) -> Array:
     """[B], J*."""
     ocp = nocl.load_ocp(problem)
-    coarse, fine = DDP(ocp), DDP(ocp, intervals=FINE)
-    found = solve_globally(coarse, x0, seed=0).best
+    coarse, fine = DDP(ocp), DDP(ocp, intervals=FINE, constraints="soft")
+    found = solve_globally(coarse, x0, seed=0)
     guesses = [np.repeat(found.u, FINE // coarse.intervals, axis=1)]
     for dynamics in DYNAMICS:
         guesses.append(nocl.simulate(ocp, nocl.pretrained(problem, dynamics), x0, nodes=FINE + 1).u[:, :-1])
