@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nocl.ocp import OCP
+from nocl.scales import steps, usual_sizes
 from nocl.smoothness import kinks
 from nocl.support import checks, interrupt
 from nocl.support.checks import Array
@@ -247,16 +248,42 @@ class _Judge:
         """dz/dtau = scale * (f, L)(x, clip(policy(x, t))), t = start + scale * tau; the quadrature is of ||u||."""
         nx = self.ocp.system.nx
         z, tau, p = ca.MX.sym("z", nx + 1), ca.MX.sym("tau"), ca.MX.sym("p", 2)
-        u = self.clip(policy(z[:nx], p[0] + p[1] * tau))
-        ode = ca.vertcat(self.f(z[:nx], u), self.ocp.L(z[:nx], u))
-        return {"x": z, "t": tau, "p": p, "ode": p[1] * ode, "quad": p[1] * ca.norm_2(u)}
+        x = self.sized(z)[:nx]
+        u = self.clip(policy(x, p[0] + p[1] * tau))
+        ode = ca.vertcat(self.f(x, u), self.ocp.L(x, u))
+        return {"x": z, "t": tau, "p": p, "ode": p[1] * self.scaled(ode), "quad": p[1] * ca.norm_2(u)}
 
     def held_dae(self) -> dict[str, Any]:
         """dz/dtau = scale * (f, L)(x, u), u held: an interval of any length is tau in [0, 1]."""
         s = self.ocp.system
         sym: Any = ca.SX if self.f.is_a("SXFunction") else ca.MX
         z, p = sym.sym("z", s.nx + 1), sym.sym("p", s.nu + 1)
-        return {"x": z, "p": p, "ode": p[-1] * ca.vertcat(self.f(z[:-1], p[:-1]), self.ocp.L(z[:-1], p[:-1]))}
+        x, u = self.sized(z)[:-1], p[:-1]
+        return {"x": z, "p": p, "ode": p[-1] * self.scaled(ca.vertcat(self.f(x, u), self.ocp.L(x, u)))}
+
+    @cached_property
+    def unit(self) -> Array:
+        """What 1 stands for in each of z, for CVODES' absolute tolerance; 1 in ordinary problems."""
+        sizes = usual_sizes(self.ocp)
+        return np.r_[steps(sizes.x), steps(sizes.cost)]
+
+    def sized(self, z: Any) -> Any:
+        return z if (self.unit == 1).all() else z * self.unit
+
+    def scaled(self, z: Any) -> Any:
+        return z if (self.unit == 1).all() else z / self.unit
+
+    def integrate(self, solver: ca.Function, z: Array, p: Any) -> tuple[Array | None, float]:
+        """(states at the solver's times, last quadrature), or None where CVODES fails or yields NaN."""
+        try:
+            with interrupt.deferred():
+                result = solver(x0=z / self.unit, p=p)
+        except RuntimeError:
+            return None, np.nan
+        end, quad = result["xf"].full() * self.unit[:, None], result["qf"].full()
+        if not np.isfinite(end).all():
+            return None, np.nan
+        return end, float(quad[0, -1]) if quad.size else 0.0
 
     def clip(self, u: Any) -> Any:
         """u in U; written so that NaN stays NaN (fmin and fmax would hide it)."""
@@ -349,7 +376,7 @@ class _Segment:
         for method in MULTISTEP:
             if method not in self.solvers:
                 self.solvers[method] = self.judge.integrator(self.dae, self.times - self.a, method)
-            path, magnitude = _integrate(self.solvers[method], z, [self.a, 1.0])
+            path, magnitude = self.judge.integrate(self.solvers[method], z, [self.a, 1.0])
             if path is not None:
                 return path.T, magnitude, ""
         return self.locate(z)
@@ -357,10 +384,10 @@ class _Segment:
     def locate(self, z: Array) -> tuple[Array, float, str]:
         """Run again interval by interval, to say where it failed."""
         path = np.full((len(self.times), len(z)), np.nan)
-        steps = [self.judge.integrator(self.dae, np.array([1.0]), method) for method in MULTISTEP]
+        each = [self.judge.integrator(self.dae, np.array([1.0]), method) for method in MULTISTEP]
         a = self.a
         for k, b in enumerate(self.times):
-            ends = (_integrate(step, z, [a, b - a])[0] for step in steps)
+            ends = (self.judge.integrate(step, z, [a, b - a])[0] for step in each)
             end = next((e for e in ends if e is not None), None)
             if end is None:
                 return path, np.nan, self.judge.blow_up(a, z[:-1], float(b), "the state blows up or the control is NaN")
@@ -384,26 +411,13 @@ class _Step:
         """
         p, path = np.c_[u, np.full(len(u), b - a)], np.full((len(z), self.m, z.shape[1] - 1), np.nan)
         for i in (i for i, m in enumerate(message) if not m):
-            ends = (_integrate(solver, z[i], p[i])[0] for solver in self.solvers)
+            ends = (self.judge.integrate(solver, z[i], p[i])[0] for solver in self.solvers)
             end = next((e for e in ends if e is not None), None)
             if end is None:
                 message[i] = self.judge.blow_up(a, z[i, :-1], b)
             else:
                 path[i], z[i] = end[:-1].T, end[:, -1]
         return path
-
-
-def _integrate(solver: ca.Function, z: Any, p: Any) -> tuple[Array | None, float]:
-    """(states at the solver's times, last quadrature), or None where CVODES fails or yields NaN."""
-    try:
-        with interrupt.deferred():
-            result = solver(x0=z, p=p)
-    except RuntimeError:
-        return None, np.nan
-    end, quad = result["xf"].full(), result["qf"].full()
-    if not np.isfinite(end).all():
-        return None, np.nan
-    return end, float(quad[0, -1]) if quad.size else 0.0
 
 
 def _failure(what: str, t: float, x: Array, until: float | None = None) -> str:

@@ -9,6 +9,7 @@ a Solution's gain is u_k + gain (x - x_k).
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -20,13 +21,28 @@ from scipy.interpolate import BSpline, make_interp_spline
 from scipy.linalg import LinAlgError, solve_continuous_are
 
 from nocl.ocp import OCP
+from nocl.scales import steps, usual_sizes
 from nocl.support import checks
 from nocl.support.checks import Array
 
 DEGREE = 5  # of the spline through P(t)
 REFINE = 3  # spline nodes for each step of the Riccati integration
 ESCAPE = 1e12  # entries of P beyond this: the Riccati solution has escaped to infinity
-STATIONARY = 1e-8  # largest |f| and |gradient| at the goal pair, beyond which it is no equilibrium
+STATIONARY = 1e-8  # largest |f| and |gradient| at the goal pair, scaled, beyond which it is no equilibrium
+
+
+@dataclass(frozen=True, eq=False)
+class _LinearQuadratic:
+    A: Array
+    B: Array
+    Q: Array
+    R: Array
+    S: Array
+    P_final: Array
+    unit: Array  # [nx, nx]
+
+    def gain(self, P: Array) -> Array:
+        return np.asarray(np.linalg.solve(self.R, self.B.T @ P + self.S.T))
 
 
 class LQR:
@@ -52,7 +68,7 @@ class LQR:
     @cached_property
     def _spline(self) -> BSpline:
         """P(t) on [0, T] as one spline, for numpy and CasADi alike."""
-        n, T = len(self.A), self.ocp.horizon
+        n, T, of = len(self.A), self.ocp.horizon, self._scaled
 
         def backward(s: float, p: Array) -> Array:
             P = p.reshape(n, n)
@@ -61,29 +77,40 @@ class LQR:
                 raise ValueError(f"LQR of {self.ocp.system.name!r}: the Riccati equation has no solution before t = "
                                  f"{T - s:.4g}; expected one on [0, {T:g}]: L may not be convex at the goal, change it "
                                  "or shorten the horizon")
-            K = self._gain(P)
-            return (self.Q + self.A.T @ P + P @ self.A - K.T @ self.R @ K).ravel()
+            K = of.gain(P)
+            return (of.Q + of.A.T @ P + P @ of.A - K.T @ of.R @ K).ravel()
 
-        path = solve_ivp(backward, (0.0, T), self.P_final.ravel(), method="LSODA", rtol=1e-11, atol=1e-12,
+        path = solve_ivp(backward, (0.0, T), of.P_final.ravel(), method="LSODA", rtol=1e-11, atol=1e-12,
                          dense_output=True)
         if not path.success:
             raise ValueError(f"LQR of {self.ocp.system.name!r}: the Riccati equation was not solved: {path.message}; "
                              "scale the states and costs")
         fine = np.linspace(0, 1, REFINE, endpoint=False)
         s = np.r_[(path.t[:-1, None] + np.diff(path.t)[:, None] * fine).ravel(), T]
-        return make_interp_spline(T - s[::-1], path.sol(s).T[::-1], k=DEGREE)
+        spline = make_interp_spline(T - s[::-1], path.sol(s).T[::-1], k=DEGREE)
+        return BSpline(spline.t, spline.c * of.unit.ravel(), DEGREE)
 
     def _solve_infinite(self) -> Array:
+        of = self._scaled
         try:
-            P = solve_continuous_are(self.A, self.B, self.Q, self.R, s=self.S)
-            stable = np.isfinite(P).all() and np.linalg.eigvals(self.A - self.B @ self._gain(P)).real.max() < 0
+            P = solve_continuous_are(of.A, of.B, of.Q, of.R, s=of.S)
+            stable = np.isfinite(P).all() and np.linalg.eigvals(of.A - of.B @ of.gain(P)).real.max() < 0
         except LinAlgError:
             stable = False
         if not stable:
             raise ValueError(f"LQR of {self.ocp.system.name!r}: no stabilising gain on an infinite horizon; expected "
                              "(A, B) stabilisable at the goal and every slow mode in L: use the finite horizon, or "
                              "a cost on the states in L")
-        return P
+        return np.asarray(P * of.unit)
+
+    @cached_property
+    def _scaled(self) -> _LinearQuadratic:
+        """The problem in units of the solvers' scales: its P times `unit` is P."""
+        sizes = usual_sizes(self.ocp)
+        x, u, c = steps(sizes.x), steps(sizes.u), float(steps(sizes.cost))
+        return _LinearQuadratic(self.A / x[:, None] * x, self.B / x[:, None] * u, self.Q * x[:, None] * x / c,
+                                self.R * u[:, None] * u / c, self.S * x[:, None] * u / c,
+                                self.P_final * x[:, None] * x / c, c / (x[:, None] * x))
 
     def _gain(self, P: Array) -> Array:
         return np.asarray(np.linalg.solve(self.R, self.B.T @ P + self.S.T), dtype=np.float64)
@@ -146,10 +173,12 @@ def _check_equilibrium(ocp: OCP) -> None:
     s, of = ocp.system, ocp.functions
     L_z = of.L_derivatives(ocp.x_goal, ocp.u_goal)[1].full().ravel()
     G_x = of.G_derivatives(ocp.x_goal)[1].full().ravel()
-    f = of.f(ocp.x_goal, ocp.u_goal).full().ravel()
-    for what, values, names in (("f", f, s.state_names), ("the gradient of L", L_z, s.names),
-                                ("the gradient of G", G_x, s.state_names)):
-        i = int(np.argmax(np.abs(values)))
-        if abs(values[i]) > STATIONARY:
+    f, sizes = of.f(ocp.x_goal, ocp.u_goal).full().ravel(), usual_sizes(ocp)
+    x, u, c = steps(sizes.x), steps(sizes.u), float(steps(sizes.cost))
+    for what, values, unit, names in (("f", f, 1 / x, s.state_names),
+                                      ("the gradient of L", L_z, np.r_[x, u] / c, s.names),
+                                      ("the gradient of G", G_x, x / c, s.state_names)):
+        i = int(np.argmax(np.abs(values * unit)))
+        if abs(values[i] * unit[i]) > STATIONARY:
             raise ValueError(f"LQR of {s.name!r}: at the goal pair {what} is {values[i]:.4g} in {names[i]}; "
                              "expected 0: LQR needs an equilibrium that is stationary for the cost; move the goal pair")

@@ -159,8 +159,9 @@ def test_many_runs_are_thinned_to_what_fits_and_keep_the_worst(mine):
         gap = np.linspace(0, 100, B)
         fields = {name: np.resize(getattr(s, name), (B, *getattr(s, name).shape[1:])) for name in
                   ("x", "u", "cost", "running_cost", "terminal_cost", "terminal_error", "control_magnitude",
-                   "saturation", "clearance", "success")}
-        fields |= {"cost": 1 + gap / 100, "clearance": np.ones(B), "success": np.ones(B, dtype=bool)}
+                   "saturation", "clearance", "violation", "success")}
+        fields |= {"cost": 1 + gap / 100, "clearance": np.ones(B), "violation": np.zeros(B),
+                   "success": np.ones(B, dtype=bool)}
         fine = Judged("fine", "continuous feedback", replace(s, message=[""] * B, **fields), *np.ones((5, B)))
         best = replace(fine, name="best", simulation=replace(fine.simulation, cost=np.ones(B)))
         return Report(mine.ocp, np.resize(mine.x0, (B, 4)), (fine, best), {}, 1.0)

@@ -311,14 +311,14 @@ class Work:
         self.mu[:] = 0
         self.backward(np.arange(B), V, V_x, V_xx)
         t = self.t0[:, None] + self.h[:, None] * np.arange(K + 1)
-        message = np.array([self._words(state) for state in self.state], dtype=object)
+        message = [self._words(int(state)) for state in self.state]
         for i, why in self._violations(t):
             self.state[i], message[i] = VIOLATED, why
         success = self.state == CONVERGED
         seconds = np.full(B, (time.perf_counter() - self.begin) / max(B, 1))
         clearance = self.ddp.ocp.least(self.x).min(axis=1, initial=np.inf)
         return Solution(t, self.x, self.u, self.gain, V, V_x, np.where(success, self.J, np.inf), success,
-                        message.astype(np.str_), seconds, self.iterations, V_xx, clearance=clearance)
+                        np.array(message, dtype=np.str_), seconds, self.iterations, V_xx, clearance=clearance)
 
     def _words(self, state: int) -> str:
         kinks = self.ddp.ocp.not_smooth if state in (OUT_OF_ITERATIONS, NO_DESCENT, NOT_CONVEX) else ""

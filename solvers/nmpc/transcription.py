@@ -20,6 +20,7 @@ import numpy as np
 
 from nocl.functions import Functions
 from nocl.ocp import OCP
+from nocl.scales import steps, usual_sizes
 from nocl.support import compiler
 from nocl.support.checks import Array
 from nocl.support.guard import Guarded, NoAnswerError
@@ -35,7 +36,7 @@ WARM: dict[str, dict[str, Any]] = {  # near a solution: a barrier that is small 
     "fatrop": {"fatrop.mu_init": 1e-8},
 }
 FLAGS = ("-O2", "-march=native", "-fPIC", "-shared")  # of compiled programs
-FEASIBLE = 1e-6  # largest violation of a constraint in a solution, in the constraint's own unit
+FEASIBLE = 1e-6  # largest violation of a constraint in a solution, in the units that the solver sees
 # how a solve ended, by the names that CasADi has for all solvers, and in words
 OUTCOMES = {"SOLVER_RET_SUCCESS": "solved", "SOLVER_RET_LIMITED": "stopped at its limit of iterations or time",
             "SOLVER_RET_INFEASIBLE": "infeasible", "SOLVER_RET_NAN": "NaN in a function",
@@ -59,7 +60,7 @@ class Answer:
     cost: float  # inf where it failed
     success: bool
     message: str
-    violation: float  # the largest, of any constraint
+    violation: float  # the largest, of any constraint, scaled
     iterations: int
     outcome: str  # how it ended: a key of OUTCOMES, GIVEN_UP, or CasADi's own name
 
@@ -68,6 +69,21 @@ class Answer:
     def rank(self) -> tuple[bool, float]:
         """Of failures: the one that says that there is no solution comes first, then the most feasible."""
         return self.outcome != INFEASIBLE, self.violation
+
+
+@dataclass(frozen=True, eq=False)
+class Scales:
+    """What 1 stands for in the program that the solver sees."""
+
+    w: Array  # of each variable
+    g: Array  # of each constraint
+    cost: float
+    x: Array  # [nx], of the states
+
+    @property
+    def ordinary(self) -> bool:
+        """Whether all of them are 1."""
+        return bool((self.w == 1).all() and (self.g == 1).all() and self.cost == 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,10 +141,21 @@ class Transcription:
         w = ca.vertcat(*(v for k in range(N) for v in (X[:, k], U[:, k])), X[:, N])
         g = ca.vertcat(*(v for k in range(N) for v in (gaps[k], *paths[k: k + 1])), *paths[N:])
         flat = ca.Function("flat", [X, U, p], [w, ca.sum2(costs) + self.end_cost(X[:, N], p[-1]), g])
-        w_sym = ca.MX.sym("w", w.numel())
-        states, controls = self.split(w_sym)
+        w_sym, scales = ca.MX.sym("w", w.numel()), self.scales
+        states, controls = self.split(w_sym if scales.ordinary else w_sym * scales.w)
         _, cost, constraints = flat(states, controls, p)
+        if not scales.ordinary:
+            cost, constraints = cost / scales.cost, constraints / scales.g
         return {"x": w_sym, "p": p, "f": cost, "g": constraints}
+
+    @cached_property
+    def scales(self) -> Scales:
+        """The sizes that the solver sees as 1, in steps of about a thousand: most problems are solved as they stand."""
+        N, usual = self.N, usual_sizes(self.ocp)
+        x, u, cost = (steps(size) for size in (usual.x, usual.u, usual.cost))
+        h = steps(self.ocp.constraint_scales) if self.n_path else np.zeros(0)
+        w = np.r_[np.tile(np.r_[x, u], N), x]
+        return Scales(w, np.r_[x, x, np.tile(np.r_[h, x], N - 1), h], float(cost), x)
 
     def split(self, w: Any) -> tuple[Any, Any]:
         """(X [nx, N+1], U [nu, N]) of the interleaved variables."""
@@ -177,8 +204,8 @@ class Transcription:
         free = np.full(s.nx, np.inf)
         stage = np.concatenate([np.zeros(s.nx), np.full(m, np.inf)])
         ubg = np.concatenate([np.zeros(2 * s.nx), np.tile(stage, N - 1), np.full(m, np.inf)])
-        return {"lbx": np.concatenate([np.tile(np.r_[-free, s.lbu], N), -free]),
-                "ubx": np.concatenate([np.tile(np.r_[free, s.ubu], N), free]),
+        return {"lbx": np.concatenate([np.tile(np.r_[-free, s.lbu], N), -free]) / self.scales.w,
+                "ubx": np.concatenate([np.tile(np.r_[free, s.ubu], N), free]) / self.scales.w,
                 "lbg": np.zeros(len(ubg)), "ubg": ubg}
 
     @cached_property
@@ -239,20 +266,21 @@ class Transcription:
     def _solve(self, x0: Array, t: Array, x: Array, u: Array) -> Answer:
         w0 = np.r_[np.c_[x[:-1], u].ravel(), x[-1]]
         solver, p = self.solver, np.r_[x0, np.diff(t), t[-1]]
-        result = solver(x0=w0, p=p, **self._limits)
+        scales = self.scales
+        result = solver(x0=w0 / scales.w, p=p, **self._limits)
         stats = solver.stats()
-        X, U = (v.full().T for v in self.split(result["x"]))
+        X, U = (v.full().T for v in self.split(result["x"] * scales.w))
         U = np.clip(U, self.ocp.system.lbu, self.ocp.system.ubu)  # IPOPT relaxes bounds by 1e-8
-        costate = -result["lam_g"].full().ravel()[self.gap_rows]
+        costate = -result["lam_g"].full().ravel()[self.gap_rows] * scales.cost / scales.x
         worst, where = self.violation(result["g"].full().ravel(), t)
         iterations = int(stats.get("iter_count", 0))
         outcome = outcome_of(stats, iterations >= self.max_iter)
         status = words(stats, outcome)
         success = bool(stats["success"] and worst <= FEASIBLE and np.isfinite(X).all())
         if not success:
-            status += f"; worst violation {worst:.3g} of {where}" if worst > FEASIBLE else \
+            status += f"; worst violation {where}" if worst > FEASIBLE else \
                 ", at a feasible point that may not be optimal"
-        cost = float(result["f"]) if success else np.inf
+        cost = float(result["f"]) * scales.cost if success else np.inf
         return Answer(X, U, costate, cost, success, status, worst, iterations, outcome)
 
     @property
@@ -272,7 +300,7 @@ class Transcription:
         return replace(self, backend="ipopt", options=(), compiled=None)
 
     def violation(self, g: Array, t: Array) -> tuple[float, str]:
-        """(largest violation of a constraint, which one: what, state, node, time)."""
+        """(largest violation of a constraint, scaled; how much, in its unit, of what, state, node, time)."""
         s = self.ocp.system
         excess = np.maximum(self.bounds["lbg"] - g, g - self.bounds["ubg"])
         excess = np.where(np.isnan(excess), np.inf, excess)
@@ -284,7 +312,7 @@ class Transcription:
             path = np.setdiff1d(np.arange(len(g)), self.gap_rows)  # node by node, from node 1
             i = int(np.flatnonzero(path == row)[0])
             node, what = 1 + i // self.n_path, f"path constraint {list(self.ocp.path_constraints)[i % self.n_path]!r}"
-        return float(excess[row]), f"{what} at node {node}, t = {t[node]:.4g}"
+        return float(excess[row]), f"{excess[row] * self.scales.g[row]:.3g} of {what} at node {node}, t = {t[node]:.4g}"
 
 
 def outcome_of(stats: dict[str, Any], limited: bool = False) -> str:
