@@ -42,7 +42,7 @@ print(json.dumps({{
     "solved": bool(s.success.all()),
     "solution": [list(a.shape) for a in (s.cost, s.x, s.u, s.costate)],
     "V": apart(n["V"] / s.cost, 1),
-    "summary": [{{k: row[k] for k in ("method", "success")}} for row in n["report"].summary()],
+    "summary": [{{k: row[k] for k in ("method", "failures")}} for row in n["report"].summary()],
     "rows": len(n["report"].rows()),
     "gaps": np.percentile(n["report"].gap, [50, 95], axis=1).tolist(),
     "f_torch": apart(n["f_torch"](torch.ones(5, 4).double(), torch.ones(5, 1).double()),
