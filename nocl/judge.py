@@ -224,12 +224,12 @@ class _Judge:
 
     @cached_property
     def jumps(self) -> str:
-        """Where f jumps in X x U, in words; "" where it does not, or is not written out."""
-        s = self.ocp.system
-        if s.xdot is None or self.f is not self.ocp.functions.f:
+        """Where f jumps in X x U, in words; "" where it does not, or is no SX."""
+        s, at = self.ocp.system, self.ocp.functions.on(self.f).stage
+        if not isinstance(at.x, ca.SX):
             return ""
-        z, box = ca.vertcat(s.x, s.u), (np.r_[s.lbx, s.lbu], np.r_[s.ubx, s.ubu])
-        found = [kink for row in ca.vertsplit(s.xdot) for kink in kinks(row, z, *box)]
+        box = (np.r_[s.lbx, s.lbu], np.r_[s.ubx, s.ubu])
+        found = [kink for row in ca.vertsplit(at.xdot) for kink in kinks(row, at.z, *box)]
         return ", ".join(dict.fromkeys(f"{kink.where} = 0" for kink in found if kink.what == "jump"))
 
     def blow_up(self, t: float, x: Array, until: float, what: str = "the state blows up") -> str:
