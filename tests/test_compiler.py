@@ -40,7 +40,7 @@ from nocl.support import compiler
 def build(folder):
     print(compiler.own_folder(), flush=True)
     sys.stdin.read()
-compiler.library("slow", [], build, sys.argv[1])
+compiler.shared_library("slow", [], build, sys.argv[1])
 """
 
 

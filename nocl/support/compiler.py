@@ -62,8 +62,8 @@ def run(arguments: Sequence[str | os.PathLike[str]], what: str) -> None:
         raise CompilerError(f"{words[0]} could not compile {what}:\n{result.stderr.strip()[-2000:]}")
 
 
-def library(kind: str, identity: Sequence[Any], build: Callable[[Path], Path],
-            cache: str | os.PathLike[str] | None = None) -> Path:
+def shared_library(kind: str, identity: Sequence[Any], build: Callable[[Path], Path],
+                   cache: str | os.PathLike[str] | None = None) -> Path:
     """The shared library that `build` makes, from the cache where a whole one is there.
 
     Parameters

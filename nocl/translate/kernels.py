@@ -77,7 +77,7 @@ class Kernel:
 
     def __init__(self, source: str, cache: str | os.PathLike[str] | None = None) -> None:
         headers = [path.read_text() for path in sorted(HEADERS.glob("*.h"))]
-        path = compiler.library("kernel", [source, headers, FLAGS], partial(_build, source), cache)
+        path = compiler.shared_library("kernel", [source, headers, FLAGS], partial(_build, source), cache)
         self._library = compiler.load(path)
         self.width = int(self._library.nocl_width())
 

@@ -171,7 +171,7 @@ class Transcription:
             return self._nlpsol(self.program, {"expand": self.expandable})
         key, folder = self.compiled
         identity = [key, ca.CasadiMeta.version(), FLAGS]
-        return self._nlpsol(str(compiler.library("nlp", identity, self._build, folder)), {})
+        return self._nlpsol(str(compiler.shared_library("nlp", identity, self._build, folder)), {})
 
     def _build(self, folder: Path) -> Path:
         """The functions that the solver calls, compiled."""
