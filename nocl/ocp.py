@@ -244,6 +244,8 @@ class OCP:
 
     def least(self, x: Array) -> Array:
         """The least value [B, number of them] of each path constraint along states x [B, n, nx]; inf for NaN."""
+        if not self.path_constraints:
+            return np.full((len(x), 0), np.inf)
         h = self.h(x.reshape(-1, x.shape[2]).T).full().reshape(len(self.path_constraints), *x.shape[:2])
         return np.where(np.isfinite(h), h, np.inf).min(axis=2, initial=np.inf).T
 
