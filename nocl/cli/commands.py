@@ -49,10 +49,18 @@ def main(argv: Sequence[str] | None = None) -> int:
         if "--debug" in words:
             traceback.print_exc()
         print(f"nocl: error: {_one_line(error)}", file=sys.stderr)
-        if isinstance(error, OSError):  # what could not be printed would be tried again at the end
-            _give_up_output()
+        _drop_unprintable()
         return 2
     return 0
+
+
+def _drop_unprintable() -> None:
+    """What cannot be printed would be tried again, and fail again, when the process ends."""
+    try:
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError:
+        _give_up_output()
 
 
 def _give_up_output() -> None:
