@@ -16,7 +16,7 @@ from nocl.ocp import OCP
 from nocl.solvers.ddp.bank import SolutionBank, better
 from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
-from nocl.translate.rk4 import rk4
+from nocl.translate.rk4 import rk4, rk4_interval
 from nocl.translate.torch_functions import to_torch
 
 Field = Callable[[Tensor, Tensor], Tensor]
@@ -54,15 +54,16 @@ class Labels:
         return Labels(s.x[:, :-1].reshape(len(h), -1), s.t[:, :-1].ravel(), s.u.reshape(-1, nu), h / cost, h)
 
     @staticmethod
-    def of(solution: Solution, f: Field, unit: float) -> Labels:
+    def of(solution: Solution, f: Field, unit: float, substeps: int = 1) -> Labels:
         """The same as continuous controls: at the middle of its interval a held one equals them to second order.
 
-        f in torch gives the states between nodes.
+        f in torch gives the states between nodes, by half of the interval's `substeps`, or one more.
         """
         start = Labels.held(solution, unit)
         with torch.no_grad():
             half = torch.from_numpy(start.dt / 2)[:, None]
-            middle = rk4(f, torch.from_numpy(start.x), torch.from_numpy(start.u), half).numpy()
+            at = (torch.from_numpy(start.x), torch.from_numpy(start.u), half)
+            middle = rk4_interval(f, *at, (substeps + 1) // 2).numpy()
         return Labels(middle, start.t + start.dt / 2, start.u, start.weight, np.zeros(len(start)))
 
     @staticmethod
@@ -105,15 +106,15 @@ def tube_states(bank: SolutionBank, n: int, width: float, horizon: float,
 def visited(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, n: int, kick: float,
             rng: np.random.Generator) -> Solution:
     """Tails from n states that the policy visits under kicks."""
-    x, t0 = kicked_states(ddp.ocp, bank, policy, f, n, kick, rng)
+    x, t0 = kicked_states(ddp.ocp, bank, policy, f, n, kick, rng, ddp.substeps)
     return answered(ddp, bank, policy, f, x, t0)
 
 
 def kicked_states(ocp: OCP, bank: SolutionBank, policy: torch.nn.Module, f: Field, n: int, kick: float,
-                  rng: np.random.Generator) -> tuple[Array, Array]:
+                  rng: np.random.Generator, substeps: int = 1) -> tuple[Array, Array]:
     """(x, t0) of n states, or fewer, that the policy visits under kicks, at any time: those not far out of the box."""
     x0 = ocp.initial_states.sample(max(n // 8, 1), rng)
-    t, x = kicked_rollout(ocp, policy, f, x0, kick * bank.scale, rng)
+    t, x = kicked_rollout(ocp, policy, f, x0, kick * bank.scale, rng, substeps=substeps)
     rows, k = rng.integers(0, len(x), n), rng.integers(0, len(t) - 1, n)
     x, t0 = x[rows, k], t[k]
     far = 10 * np.maximum(np.abs(ocp.system.lbx), np.abs(ocp.system.ubx))
@@ -126,13 +127,13 @@ def kicked_states(ocp: OCP, bank: SolutionBank, policy: torch.nn.Module, f: Fiel
 
 def answered(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, x: Array, t0: Array) -> Solution:
     """Tails from (x, t0): the better of a start from the policy's own answer and one from the nearest solution."""
-    own = ddp.solve(x, t0, u=policy_controls(policy, f, x, t0, ddp.ocp.horizon, ddp.intervals))
+    own = ddp.solve(x, t0, u=policy_controls(policy, f, x, t0, ddp.ocp.horizon, ddp.intervals, ddp.substeps))
     near = ddp.solve(x, t0, **bank.guess(bank.nearest(x, t0)[:, 0], t0))
     return better(own, near)
 
 
 def kicked_rollout(ocp: OCP, policy: torch.nn.Module, f: Field, x0: Array, kick: Array, rng: np.random.Generator,
-                   steps: int = 160, kicks: int = 6) -> tuple[Array, Array]:
+                   steps: int = 160, kicks: int = 6, substeps: int = 1) -> tuple[Array, Array]:
     """The policy's states (t [steps+1], x [B, steps+1, nx]) from x0, pushed by N(0, kick^2) at `kicks` random times."""
     h = ocp.horizon / steps
     x, path = torch.from_numpy(x0), [x0]
@@ -142,12 +143,13 @@ def kicked_rollout(ocp: OCP, policy: torch.nn.Module, f: Field, x0: Array, kick:
             push = (times == k).sum(axis=0)[:, None] * kick * rng.standard_normal(x0.shape)
             x = x + torch.from_numpy(push)
             u = policy(x, torch.full((len(x), 1), (k + 0.5) * h, dtype=x.dtype))
-            x = rk4(f, x, u, h)
+            x = rk4_interval(f, x, u, h, substeps)
             path.append(x.numpy())
     return np.linspace(0, ocp.horizon, steps + 1), np.stack(path, axis=1)
 
 
-def policy_controls(policy: torch.nn.Module, f: Field, x: Array, t0: Array, horizon: float, K: int) -> Array:
+def policy_controls(policy: torch.nn.Module, f: Field, x: Array, t0: Array, horizon: float, K: int,
+                    substeps: int = 1) -> Array:
     """The controls [B, K, nu] that the policy gives from (x, t0), each held over an interval of [t0, T]."""
     state, start = torch.from_numpy(x), torch.from_numpy(t0)[:, None]
     h = (horizon - start) / K
@@ -155,7 +157,7 @@ def policy_controls(policy: torch.nn.Module, f: Field, x: Array, t0: Array, hori
     with torch.no_grad():
         for k in range(K):
             controls.append(policy(state, start + (k + 0.5) * h))
-            state = rk4(f, state, controls[-1], h)
+            state = rk4_interval(f, state, controls[-1], h, substeps)
     return torch.stack(controls, dim=1).numpy()
 
 

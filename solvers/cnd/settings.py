@@ -27,7 +27,9 @@ class TrainSettings(Scaled):
                  "value_visits": 6000, "value_iterations": 10_000, "value_error": 1e-3, "held_out": 128,
                  "gap_median": 5e-5, "gap_p95": 2.5e-4}}
 
-    intervals: int = count(80, "RK4 steps and held controls of each labelled solution")
+    intervals: int = count(80, "held controls of each labelled solution")
+    substeps: int | None = count(None, "RK4 steps in each interval", none="as many as a few solutions ask for, held "
+                                 "against the plant on far shorter steps; the card says how many")
     seeds: int = count(20, "initial states solved globally, from cold starts")
     starts: int = count(16, "cold starts of each")
     states: int = count(400, "further initial states, solved from their neighbours", least=0)

@@ -51,6 +51,7 @@ from nocl.solvers.cnd.value import ValueLabels, on_fine_grid, value_loss, value_
 from nocl.solvers.ddp.bank import SolutionBank, extend
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP
+from nocl.solvers.grid import TRIED, measured
 from nocl.support import store
 from nocl.support.checks import Array
 from nocl.support.threads import one_thread
@@ -65,6 +66,7 @@ CHECKPOINT = "training.safetensors"
 VALUE_LARGE = 0.05  # mean |V - J*| / J* that a warning is given above
 VALUE_HELD_OUT = 16  # times held_out: a mean of relative errors hangs on the few states that are hard
 LOSSES = 40  # of each regression that the card keeps
+PROBES = 8  # initial states that substeps are chosen on
 STREAM = 0x6E6F636C  # training's own random numbers: never those of initial_states.sample(n, seed), whatever the seeds
 
 
@@ -121,6 +123,23 @@ def _expect(settings: Any, kind: Any) -> Any:
     return settings or kind()
 
 
+def substeps_for(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int) -> int:
+    """As many as a few initial states' solutions ask for; more are tried where nothing is solved with few."""
+    functions = ocp.functions if dynamics is None else ocp.functions.on(dynamics.to_casadi())
+    substeps, grid = 1, None
+    while substeps <= TRIED[-1]:
+        ddp = DDP(ocp, intervals=intervals, substeps=substeps, dynamics=dynamics, constraints="soft")
+        ddp.checked = True
+        grid = measured(ocp, functions, ddp.solve(ocp.initial_states.sample(PROBES, 0)), substeps)
+        if grid is not None and grid.needed == substeps:
+            return substeps
+        if grid is not None and grid.needed is None:
+            warnings.warn(f"{ocp.system.name}: {grid}", stacklevel=5)
+            return TRIED[-1]
+        substeps = 4 * substeps if grid is None or grid.needed is None else grid.needed
+    return 1  # nothing can be solved: what follows says so
+
+
 class Training:
     """One run of the default method; its state between rounds is what a checkpoint holds."""
 
@@ -129,8 +148,10 @@ class Training:
         self.ocp, self.settings, self.seed = ocp, settings, seed
         self.learned = dynamics is not None
         self.f = to_torch(ocp.functions.f) if dynamics is None else dynamics
-        self.ddp = DDP(ocp, intervals=settings.intervals, dynamics=dynamics, constraints="soft")
-        self.fine = DDP(ocp, intervals=4 * settings.intervals, dynamics=dynamics, constraints="soft")
+        self.substeps = settings.substeps or substeps_for(ocp, dynamics, settings.intervals)
+        soft = {"dynamics": dynamics, "constraints": "soft"}
+        self.ddp = DDP(ocp, intervals=settings.intervals, substeps=self.substeps, **soft)
+        self.fine = DDP(ocp, intervals=4 * settings.intervals, substeps=-(-self.substeps // 4), **soft)
         self.checkpoint = None if out is None else Path(out) / CHECKPOINT
         self.hidden_progress = None if progress is None else not progress
         self.round, self.seconds, self.fitting, self.fitting_cpu, self.evaluations = 0, 0.0, 0.0, 0.0, 0
@@ -178,7 +199,7 @@ class Training:
 
     def _labels(self, solution: Solution, rng: np.random.Generator) -> Labels:
         """Labels of the continuous controls, and with control_dt of held ones."""
-        parts = [Labels.of(solution, self.f, self._unit())]
+        parts = [Labels.of(solution, self.f, self._unit(), self.substeps)]
         if self.settings.control_dt:
             parts += [Labels.held(solution, self._unit()), at_other_rates(self.ddp, solution, self._unit(), rng)]
         return Labels.join(parts)
@@ -220,12 +241,12 @@ class Training:
             tails = kicked_optima(*solvers, self.policy, self.f, 4 * s.held_out, s.kick, rng)
             row = {"round": self.round, "labels": len(self.labels), "loss": self.losses,
                    "unsolved": s.held_out - len(starts),
-                   **summary(gap(self.ocp, self.policy, self.f, starts), "gap"),
-                   **summary(gap(self.ocp, self.policy, self.f, tails, self._unit()), "kicked")}
+                   **summary(gap(self.ocp, self.policy, self.f, starts, substeps=self.fine.substeps), "gap"),
+                   **summary(gap(self.ocp, self.policy, self.f, tails, self._unit(), self.fine.substeps), "kicked")}
             if s.control_dt:
                 best = extend(self.ddp, self.bank, starts.x[:, 0])
                 held = at_rate(self.net, self.ocp.horizon / s.intervals)
-                row |= summary(held_gap(self.ocp, held, self.f, best), "held")
+                row |= summary(held_gap(self.ocp, held, self.f, best, self.substeps), "held")
             bar.set_postfix_str(f"gap {100 * row['gap_median']:.3f} %, p95 {100 * row['gap_p95']:.3f} %, "
                                 f"kicked {100 * row['kicked_median']:.3f} %")
             bar.update()
@@ -304,7 +325,7 @@ class Training:
                 "seconds": round(self.seconds, 1),
                 "fitting_seconds": round(self.fitting, 1),  # of these, fits of networks; the others solve problems
                 "fitting_cpu_seconds": round(self.fitting_cpu, 1),
-                "dynamics_evaluations": self._evaluations(),
+                "dynamics_evaluations": self._evaluations(), "substeps": self.substeps,
                 "settings": asdict(self.settings), "history": self.history, "value": self.value_card}
 
     def _evaluations(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from nocl.solvers.cnd.labels import SMALL, Field, answered, continuous_cost, kic
 from nocl.solvers.ddp.bank import SolutionBank, extend
 from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
+from nocl.translate.rk4 import rk4_cost
 from nocl.translate.torch_functions import to_torch
 
 NODES = 16  # of each solution at which the HJB residual is taken
@@ -35,7 +37,7 @@ def held_out_optima(ddp: DDP, fine: DDP, bank: SolutionBank, x0: Array) -> Solut
 def kicked_optima(ddp: DDP, fine: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, n: int, kick: float,
                   rng: np.random.Generator) -> Solution:
     """The optima from n states that the policy visits under kicks, at times all over the horizon."""
-    x, t0 = kicked_states(ddp.ocp, bank, policy, f, n, kick, rng)
+    x, t0 = kicked_states(ddp.ocp, bank, policy, f, n, kick, rng, ddp.substeps)
     return refined(fine, answered(ddp, bank, policy, f, x, t0))
 
 
@@ -55,17 +57,18 @@ def tube_optima(ddp: DDP, fine: DDP, bank: SolutionBank, policy: torch.nn.Module
     return refined(fine, answered(ddp, bank, policy, f, x, t0))
 
 
-def gap(ocp: OCP, policy: torch.nn.Module, f: Field, best: Solution, unit: float = 0.0) -> Array:
+def gap(ocp: OCP, policy: torch.nn.Module, f: Field, best: Solution, unit: float = 0.0, substeps: int = 1) -> Array:
     """(J - J*) / (|J*| + SMALL unit) [B] of the policy as continuous feedback, from where the solutions start."""
-    J = continuous_cost(ocp, policy, f, best.x[:, 0], best.u.shape[1], best.t[:, 0])
+    J = continuous_cost(ocp, policy, f, best.x[:, 0], substeps * best.u.shape[1], best.t[:, 0])
     shares: Array = (J - best.cost) / (np.abs(best.cost) + SMALL * unit)
     return shares
 
 
-def held_gap(ocp: OCP, policy: torch.nn.Module, f: Field, best: Solution) -> Array:
+def held_gap(ocp: OCP, policy: torch.nn.Module, f: Field, best: Solution, substeps: int = 1) -> Array:
     """The same of a policy that is asked at the solutions' nodes and held; they start at t = 0."""
     with torch.no_grad():
-        path = rollout(policy, f, to_torch(ocp.L_soft), torch.from_numpy(best.x[:, 0]), ocp.horizon, best.u.shape[1])
+        path = rollout(policy, f, to_torch(ocp.L_soft), torch.from_numpy(best.x[:, 0]), ocp.horizon, best.u.shape[1],
+                       step=partial(rk4_cost, substeps=substeps))
         J = (path.running + to_torch(ocp.G)(path.x[:, -1]))[:, 0].numpy()
     shares: Array = (J - best.cost) / np.abs(best.cost)
     return shares

@@ -73,7 +73,7 @@ def value_tails(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field,
     kicks."""
     x0 = ddp.ocp.initial_states.sample(initial, rng)
     _, t_tube, x_tube = tube_states(bank, tails, width, ddp.ocp.horizon, rng)
-    x_kicked, t_kicked = kicked_states(ddp.ocp, bank, policy, f, visits, kick, rng)
+    x_kicked, t_kicked = kicked_states(ddp.ocp, bank, policy, f, visits, kick, rng, ddp.substeps)
     x, t = np.concatenate([x0, x_tube, x_kicked]), np.concatenate([np.zeros(initial), t_tube, t_kicked])
     return answered(ddp, bank, policy, f, x, t)
 

@@ -35,13 +35,17 @@ def pack_weights(net: Any) -> Array:
     return np.concatenate([np.zeros(1), *(p.detach().double().cpu().numpy().ravel() for p in parts)])
 
 
-def ddp_source(ocp: OCP, net: Any = None) -> str:
-    """The generated part of the kernel: what csrc/ddp.h lists, for the exact f or for f_theta's FeatureNet."""
+def ddp_source(ocp: OCP, net: Any = None, substeps: int = 1) -> str:
+    """The generated part of the kernel: what csrc/ddp.h lists, for the exact f or for f_theta's FeatureNet.
+
+    substeps : Runge-Kutta steps in each interval
+    """
     at = ocp.functions.stage
     stage = _Derivatives(at, net)
     nets, networks, n, m = stage.nets, stage.networks, ocp.system.nx, ocp.system.nu
     sizes = {"N": n, "M": m, "NET": networks.numel(), "TAPE": sum(n.tape for n in nets),
-             "NV": stage.v.numel(), "BEND": stage.bend.numel(), "NJ": stage.J.nnz(), "NW": stage.W.nnz()}
+             "NV": stage.v.numel(), "BEND": stage.bend.numel(), "NJ": stage.J.nnz(), "NW": stage.W.nnz(),
+             "SUBSTEPS": substeps}
     lines = ['#include "lanes.h"', *(['#include "mlp.h"'] if nets else []),
              *(f"#define {name} {value}" for name, value in sizes.items()), _STEP, _networks(at, nets),
              emit("field", [*at.inputs, networks], [ca.densify(stage.rhs)]),

@@ -13,6 +13,7 @@ from __future__ import annotations
 import os
 import sys
 import time
+import warnings
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -29,6 +30,7 @@ from nocl.ocp import OCP
 from nocl.solvers.ddp.batch import Job, Piece, Rows, assembled, pieces
 from nocl.solvers.ddp.kernel import ddp_source, pack_weights
 from nocl.solvers.ddp.without_compiler import ddp_kernel
+from nocl.solvers.grid import measured
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.support.fields import Checked, count, positive
@@ -67,7 +69,9 @@ class DDP:
     ----------
     ocp : OCP
     intervals : int
-        K, the number of RK4 steps and held controls on [t0, T].
+        K, the number of held controls on [t0, T].
+    substeps : int
+        RK4 steps in each interval; more for fast dynamics.
     dynamics : LearnedDynamics, optional
         f_theta in place of the exact f; its networks' derivatives are generated C too.
     constraints : "hard" or "soft"
@@ -79,28 +83,31 @@ class DDP:
         Default: the folder that NOCL_CACHE names, or else one that goes with the process.
     """
 
-    def __init__(self, ocp: OCP, *, intervals: int = 80, dynamics: LearnedDynamics | None = None,
+    def __init__(self, ocp: OCP, *, intervals: int = 80, substeps: int = 1, dynamics: LearnedDynamics | None = None,
                  settings: DDPSettings | None = None, constraints: str = "hard", threads: int | None = None,
                  cache: str | os.PathLike[str] | None = None) -> None:
         checks.problem(ocp, "DDP")
-        for name, value in (("intervals", intervals), ("threads", 1 if threads is None else threads)):
+        for name, value in (("intervals", intervals), ("substeps", substeps),
+                            ("threads", 1 if threads is None else threads)):
             if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
                 raise ValueError(f"DDP: {name} is {value!r}; expected an integer >= 1")
         if constraints not in ("hard", "soft"):
             raise ValueError(f"DDP: constraints is {constraints!r}; expected 'hard' or 'soft'")
         self.ocp, self.intervals, self.settings = ocp, int(intervals), settings or DDPSettings()
-        self.constraints = constraints
+        self.constraints, self.substeps = constraints, int(substeps)
+        self.checked = False  # whether the grid was held against the plant
         self.threads = int(threads or os.cpu_count() or 1)
         self.dynamics, self.cache = dynamics, cache
         self.evaluations: Counter[str] = Counter()  # of f in this process, one for each state: "rollout", "backward"
         net = None if dynamics is None else _fitting(ocp, dynamics)
         self._weights = np.zeros(1) if net is None else pack_weights(net)
-        self.kernel = ddp_kernel(ocp, dynamics, cache)
+        self.kernel = ddp_kernel(ocp, dynamics, cache, self.substeps)
         self._lb, self._ub = np.ascontiguousarray(ocp.system.lbu), np.ascontiguousarray(ocp.system.ubu)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"ocp": self.ocp, "intervals": self.intervals, "dynamics": self.dynamics, "settings": self.settings,
-                "constraints": self.constraints, "threads": self.threads, "cache": self.cache}
+        return {"ocp": self.ocp, "intervals": self.intervals, "substeps": self.substeps, "dynamics": self.dynamics,
+                "settings": self.settings, "constraints": self.constraints, "threads": self.threads,
+                "cache": self.cache}
 
     def __setstate__(self, options: dict[str, Any]) -> None:
         DDP.__init__(self, **options)  # the kernel is built, or found in the cache, where it is needed
@@ -131,7 +138,19 @@ class DDP:
                           else "", "DDP")
         show = sys.stderr.isatty() if progress is None else progress
         tasks = pieces(self, rows, times, guess, curvature)
-        return assembled(len(rows), stream(Job(here), tasks, pool, journal, show, f"DDP, {self.ocp.system.name}"))
+        solution = assembled(len(rows), stream(Job(here), tasks, pool, journal, show, f"DDP, {self.ocp.system.name}"))
+        self._check_grid(solution)
+        return solution
+
+    def _check_grid(self, solution: Solution) -> None:
+        """Warns, once, where the first solutions show a grid that is too coarse."""
+        if self.checked or not solution.success.any():
+            return
+        self.checked = True
+        f = None if self.dynamics is None else self.dynamics.to_casadi()
+        grid = measured(self.ocp, self.ocp.functions.on(f) if f else self.ocp.functions, solution, self.substeps)
+        if grid is not None and grid.coarse:
+            warnings.warn(f"DDP of {self.ocp.system.name}: {grid}", stacklevel=3)
 
     def descend(self, batch: Piece) -> Solution:
         """Solve one piece of a batch, here."""
@@ -181,7 +200,7 @@ class DDP:
     def key(self) -> str:
         """A fingerprint of the problem, the model and the settings."""
         net = None if self.dynamics is None else self.dynamics.net
-        return fingerprint(self.ocp.to_data(), ddp_source(self.ocp, net), self._weights,
+        return fingerprint(self.ocp.to_data(), ddp_source(self.ocp, net, self.substeps), self._weights,
                            self.intervals, self.settings, self.constraints, version("nocl"))
 
     def _run_key(self, x0: Array, t0: Array, guess: dict[str, Array], curvature: bool) -> str:
@@ -232,14 +251,14 @@ class Work:
 
     def rollout(self, rows: Rows, x_bar: Array, u_bar: Array, gain: Array) -> None:
         d = self.ddp
-        d.evaluations["rollout"] += STAGES * d.intervals * len(rows)
+        d.evaluations["rollout"] += STAGES * d.substeps * d.intervals * len(rows)
         d.kernel("nocl_rollout", rows, d.intervals, d._weights, d._lb, d._ub, self.h, self.x0, x_bar, u_bar, self.k,
                  gain, self.alpha, self.new_x, self.new_u, self.new_J, threads=d.threads)
 
     def backward(self, rows: Rows, V: Array | None = None, V_x: Array | None = None,
                   V_xx: Array | None = None) -> None:
         d = self.ddp
-        d.evaluations["backward"] += STAGES * d.intervals * len(rows)  # with first and second derivatives
+        d.evaluations["backward"] += STAGES * d.substeps * d.intervals * len(rows)  # with first and second derivatives
         d.kernel("nocl_backward", rows, d.intervals, d._weights, d._lb, d._ub, self.h, self.x, self.u, self.mu, self.k,
                   self.gain, self.slope, self.curve, self.positive, V, V_x, V_xx, threads=d.threads)
 

@@ -24,13 +24,14 @@ Rows = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 
-def ddp_kernel(ocp: OCP, dynamics: Any, cache: str | os.PathLike[str] | None) -> Kernel | NumpyKernel:
+def ddp_kernel(ocp: OCP, dynamics: Any, cache: str | os.PathLike[str] | None,
+               substeps: int = 1) -> Kernel | NumpyKernel:
     """The compiled kernel, or its twin, with a warning said once, where there is no compiler."""
     try:
-        return Kernel(ddp_source(ocp, None if dynamics is None else dynamics.net), cache)
+        return Kernel(ddp_source(ocp, None if dynamics is None else dynamics.net, substeps), cache)
     except NoCompilerError as error:
         say_once(f"{error}. DDP goes on in CasADi's virtual machine and numpy, with the same numbers, much slower")
-        return NumpyKernel(ocp, dynamics)
+        return NumpyKernel(ocp, dynamics, substeps)
 
 
 @lru_cache
@@ -43,13 +44,13 @@ class NumpyKernel:
 
     width = 1
 
-    def __init__(self, ocp: OCP, dynamics: Any = None) -> None:
+    def __init__(self, ocp: OCP, dynamics: Any = None, substeps: int = 1) -> None:
         of = ocp.functions if dynamics is None else ocp.functions.on(dynamics.to_casadi())
         at, self.shape = of.stage, (ocp.system.nx, ocp.system.nu)
         h, lam = at.sym("h"), at.sym("lam", ocp.system.nx)
-        after, cost = at.interval(h)
+        after, cost = at.interval(h, substeps=substeps)
         H, g = ca.hessian(ca.dot(lam, after) + cost, at.z)[0], ca.gradient(cost, at.z)
-        self._step, self._terminal = of.step(), of.G_derivatives
+        self._step, self._terminal = of.step(substeps=substeps), of.G_derivatives
         self._slopes = at.function("slopes", {"cost": cost, "F_z": ca.jacobian(after, at.z), "cost_z": g, "Q_zz": H},
                                    h=h, lam=lam)
 

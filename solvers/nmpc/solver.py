@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property, lru_cache
@@ -18,6 +19,7 @@ from numpy.typing import ArrayLike
 from nocl.data import Solution, Trajectory
 from nocl.judge import check_made_for, dynamics_function
 from nocl.ocp import OCP
+from nocl.solvers.grid import measured
 from nocl.solvers.lqr import LQR
 from nocl.solvers.mirrors import Mirror, mirrors
 from nocl.solvers.nmpc import guesses as starting
@@ -175,7 +177,18 @@ class NMPC:
         search.stage("NMPC", search.cold, np.arange(len(rows)), 0, n)
         search.improve(n)
         solution = states.finished(search.solution())
+        self._check_grid(solution)
         return self.with_gains(solution) if gains else solution
+
+    def _check_grid(self, solution: Solution) -> None:
+        """Warns, once for each program, where the first solutions show a grid that is too coarse."""
+        p = self.program
+        if p.checked or self.terminal is not None or not solution.success.any():
+            return
+        p.checked.append(True)
+        grid = measured(self.ocp, p.functions, solution, self.substeps)
+        if grid is not None and grid.coarse:
+            warnings.warn(f"NMPC of {self.ocp.system.name}: {grid}", stacklevel=3)
 
     def with_gains(self, solution: Solution) -> Solution:
         """A Solution of this NMPC with its feedback `gain` and `V_xx`.

@@ -246,6 +246,11 @@ class Transcription:
         return [0.0]  # seconds of the slowest solve that came back
 
     @cached_property
+    def checked(self) -> list[bool]:
+        """Not empty once its grid was held against the plant."""
+        return []
+
+    @cached_property
     def _guarded(self) -> Guarded:
         self.solver  # noqa: B018 - built here, the copies have it
         return Guarded(self._solve)

@@ -14,6 +14,8 @@
                                               (only its lower triangle is read); these two may stand in chain.h
    terminal(x, G, Gx, Gxx)
 
+   and SUBSTEPS, the Runge-Kutta steps in each interval, whose control is held over all of them.
+
    Arrays are problem-major, rows as numpy has them: x [B, K+1, N], u [B, K, M], gains [B, K, M, N]. */
 /* One Runge-Kutta step, x to next; returns its cost. */
 static lane step(const double *weights, const lane *x, const lane *u, lane h, lane *next)
@@ -53,8 +55,10 @@ void nocl_rollout(int64_t first, int64_t last, const int64_t *index, int64_t K, 
                 u[j] = where(u[j] < splat(lb[j]), splat(lb[j]), where(u[j] > splat(ub[j]), splat(ub[j]), u[j]));
                 scatter(u_, at, K * M, t * M + j, u[j]);
             }
-            cost += step(weights, x, u, h, next);
-            for (int i = 0; i < N; ++i) x[i] = next[i];
+            for (int part = 0; part < SUBSTEPS; ++part) {
+                cost += step(weights, x, u, h / SUBSTEPS, next);
+                for (int i = 0; i < N; ++i) x[i] = next[i];
+            }
         }
         for (int i = 0; i < N; ++i) scatter(x_, at, (K + 1) * N, K * N + i, x[i]);
         terminal(x, G, Gx, Gxx);
@@ -220,6 +224,47 @@ static void action_value(const lane *F, const lane *l, const lane *H, const lane
     }
 }
 
+/* Q and q in z = (x, u) before one more step with u held, from theirs after it. */
+static void earlier(const lane *F, const lane *l, const lane *H, lane Q[NZ][NZ], lane *q)
+{
+    lane Vx[N], Vxx[N * N], old[NZ][NZ], qu[M];
+    for (int i = 0; i < N; ++i) {
+        Vx[i] = q[i];
+        for (int j = 0; j < N; ++j) Vxx[i * N + j] = Q[i][j];
+    }
+    for (int i = 0; i < NZ; ++i)
+        for (int j = 0; j < NZ; ++j) old[i][j] = Q[i][j];
+    for (int j = 0; j < M; ++j) qu[j] = q[N + j];
+    action_value(F, l, H, Vx, Vxx, Q, q);
+    for (int a = 0; a < M; ++a) {
+        q[N + a] += qu[a];
+        for (int j = 0; j < NZ; ++j) {
+            lane sum = j < N ? (lane){0} : old[N + a][j];
+            for (int r = 0; r < N; ++r) sum += old[N + a][r] * F[r * NZ + j];
+            Q[N + a][j] += sum;
+            Q[j][N + a] = j < N ? Q[N + a][j] : Q[j][N + a];
+        }
+        for (int c = 0; c < M; ++c)
+            for (int r = 0; r < N; ++r) Q[N + c][N + a] += old[N + a][r] * F[r * NZ + N + c];
+    }
+}
+
+/* Q and q of an interval from V at its end; returns its cost. */
+static lane interval(const double *weights, const lane *x, const lane *u, lane h, const lane *Vx, const lane *Vxx,
+                     lane Q[NZ][NZ], lane *q)
+{
+    lane s[SUBSTEPS][N], F[N * NZ], l[NZ], H[NZ * NZ], cost;
+    for (int i = 0; i < N; ++i) s[0][i] = x[i];
+    for (int part = 1; part < SUBSTEPS; ++part) step(weights, s[part - 1], u, h / SUBSTEPS, s[part]);
+    cost = derivatives(weights, s[SUBSTEPS - 1], u, Vx, h / SUBSTEPS, F, l, H);
+    action_value(F, l, H, Vx, Vxx, Q, q);
+    for (int part = SUBSTEPS - 2; part >= 0; --part) {
+        cost += derivatives(weights, s[part], u, q, h / SUBSTEPS, F, l, H);
+        earlier(F, l, H, Q, q);
+    }
+    return cost;
+}
+
 /* V of this node from the next one's, under u + k + gain dx. */
 static void value_update(lane Q[NZ][NZ], const lane *q, const lane *k, lane gain[M][N], lane *Vx, lane *Vxx)
 {
@@ -262,12 +307,11 @@ void nocl_backward(int64_t first, int64_t last, const int64_t *index, int64_t K,
             if (Vx_) for (int i = 0; i < N; ++i) scatter(Vx_, at, (K + 1) * N, t * N + i, Vx[i]);
             if (Vxx_) for (int i = 0; i < N * N; ++i) scatter(Vxx_, at, (K + 1) * N * N, t * N * N + i, Vxx[i]);
             if (t == 0) break;
-            lane F[N * NZ], l[NZ], H[NZ * NZ], Q[NZ][NZ], q[NZ], Quu[M][M], L[M][M], k[M], gain[M][N];
+            lane Q[NZ][NZ], q[NZ], Quu[M][M], L[M][M], k[M], gain[M][N];
             mask held[M];
             for (int i = 0; i < N; ++i) x[i] = gather(x_, at, (K + 1) * N, (t - 1) * N + i);
             for (int j = 0; j < M; ++j) u[j] = gather(u_, at, K * M, (t - 1) * M + j);
-            V[0] += derivatives(weights, x, u, Vx, h, F, l, H);
-            action_value(F, l, H, Vx, Vxx, Q, q);
+            V[0] += interval(weights, x, u, h, Vx, Vxx, Q, q);
             for (int i = 0; i < M; ++i)
                 for (int j = 0; j < M; ++j) Quu[i][j] = Q[N + i][N + j] + (i == j ? reg : (lane){0});
             positive &= boxed_newton(Quu, q + N, u, lb, ub, held, k, L);

@@ -1,0 +1,100 @@
+"""Steps that are too long for a plant: found, told, and cured by substeps, which all solvers share."""
+
+import warnings
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import nocl
+from nocl.solvers import DDP, NMPC
+from nocl.solvers.cnd.training import substeps_for
+from nocl.solvers.ddp.without_compiler import NumpyKernel
+from nocl.solvers.grid import COARSE, TRIED, WANTED, measured
+from nocl.systems import NAMES
+
+X0 = np.array([1.0, 0.0])
+
+
+def lag(rate):
+    """An integrator behind an actuator that lags by 1 / rate: for rate h > 2.8 RK4 is unstable."""
+    x, z, u = ca.SX.sym("x"), ca.SX.sym("z"), ca.SX.sym("u")
+    system = nocl.System("lag", x=ca.vertcat(x, z), u=u, xdot=ca.vertcat(z, rate * (u - z)), lbu=[-1], ubu=[1],
+                         lbx=[-3, -2], ubx=[3, 2])
+    return nocl.OCP(system, horizon=4.0, running=0.1 * u**2, terminal=5 * x**2 + z**2, x_goal=[0, 0], u_goal=[0],
+                    initial_states=nocl.Gaussian(mean=X0, std=[0.1, 0.1]))
+
+
+@pytest.mark.parametrize("substeps", [2, 3])
+def test_ddp_and_nmpc_share_the_discretisation(substeps):
+    ocp = nocl.load_ocp("cartpole")
+    x0 = ocp.initial_states.sample(3, 0)
+    mine = DDP(ocp, intervals=20, substeps=substeps).solve(x0)
+    theirs = NMPC(ocp, 20, substeps=substeps, starts=1, passes=0).solve(x0, mine, gains=True, workers=1)
+    assert mine.success.all()
+    np.testing.assert_allclose(theirs.cost, mine.cost, rtol=1e-8)
+    np.testing.assert_allclose(theirs.V_x, mine.V_x, rtol=0, atol=1e-5 * np.abs(mine.V_x).max())
+    np.testing.assert_allclose(theirs.gain, mine.gain, rtol=0, atol=1e-4 * np.abs(mine.gain).max())
+
+
+@pytest.mark.parametrize("problem", ["dubins", "quadrotor", "acrobot"])
+def test_the_compiled_sweep_over_substeps_is_that_of_casadis_derivatives(problem):
+    ocp = nocl.load_ocp(problem)
+    ddp, x0 = DDP(ocp, intervals=12, substeps=3), ocp.initial_states.sample(5, 0)
+    compiled = ddp.solve(x0, curvature=True)
+    ddp.kernel = NumpyKernel(ocp, None, 3)
+    slow = ddp.solve(x0, curvature=True)
+    for name in ("x", "u", "gain", "V", "V_x", "V_xx"):
+        a, b = getattr(compiled, name), getattr(slow, name)
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-8 * max(np.abs(b).max(), 1.0), err_msg=name)
+
+
+def test_one_step_of_four_substeps_is_four_steps_with_the_control_held():
+    ocp = nocl.load_ocp("pendulum")
+    u = np.random.default_rng(0).uniform(-2, 2, (3, 10, 1))
+    x0 = ocp.initial_states.sample(3, 0)
+    long, short = DDP(ocp, intervals=10, substeps=4), DDP(ocp, intervals=40)
+    np.testing.assert_allclose(long.rollout(x0, u=u), short.rollout(x0, u=np.repeat(u, 4, axis=1))[:, ::4], rtol=1e-12)
+
+
+@pytest.mark.parametrize("rate", [54.0, 60.0, 150.0])
+def test_a_grid_that_is_too_coarse_is_told_by_both_solvers_and_what_helps_helps(rate):
+    ocp = lag(rate)
+    for make in (lambda n: DDP(ocp, substeps=n), lambda n: NMPC(ocp, 80, substeps=n, starts=2, passes=0)):
+        with pytest.warns(UserWarning, match="the grid is too coarse for this system"):
+            coarse = make(1).solve(X0)
+        grid = measured(ocp, ocp.functions, coarse, 1)
+        assert grid.error > COARSE
+        assert grid.fastest == pytest.approx(1 / rate)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            fine = make(grid.needed).solve(X0)
+        judged = nocl.simulate(ocp, fine.u, X0).cost[0]
+        assert fine.cost[0] == pytest.approx(judged, rel=1e-3)
+        assert judged == pytest.approx({54.0: 0.02523, 60.0: 0.02522, 150.0: 0.02519}[rate], rel=1e-3)
+    assert substeps_for(ocp, None, 80) >= grid.needed
+
+
+def test_it_is_told_once():
+    ddp = DDP(lag(60.0))
+    with pytest.warns(UserWarning, match="substeps="):
+        ddp.solve(X0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        ddp.solve(X0)
+
+
+def test_what_no_explicit_step_can_follow_is_said_to_be():
+    solution = DDP(lag(60.0), substeps=8).solve(X0)
+    grid = measured(lag(3e3), lag(3e3).functions, solution, 1)
+    assert grid.coarse
+    assert grid.needed is None
+    assert f"not even with substeps={TRIED[-1]}" in str(grid)
+    assert "0.333 ms" in str(grid)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_problems_that_come_with_nocl_need_one_step(name):
+    ocp = nocl.load_ocp(name)
+    assert substeps_for(ocp, None, 80) == 1
+    assert WANTED < COARSE
