@@ -6,6 +6,8 @@ import pytest
 
 import nocl
 from nocl.solvers.cnd.features import features
+from nocl.solvers.ddp.bank import SolutionBank, extend
+from nocl.solvers.ddp.solver import DDP
 from nocl.solvers.lqr import LQR
 from nocl.solvers.nmpc.solver import NMPC
 
@@ -90,3 +92,52 @@ def test_a_trained_controller_answers_alike_to_images():
     np.testing.assert_allclose(cnd(wrapped), cnd(x0), atol=1e-9)
     np.testing.assert_allclose(cnd.value(wrapped), cnd.value(x0), rtol=1e-9)
     np.testing.assert_allclose(nocl.simulate(ocp, cnd, wrapped).cost, nocl.simulate(ocp, cnd, x0).cost, rtol=1e-6)
+
+
+def test_a_bank_finds_the_nearest_image_and_answers_as_it_does_without_turns():
+    """From a state and from the same state some turns away: the same solution, control and value."""
+    ocp = pendulum()
+    ddp, x0 = DDP(ocp, intervals=30), ocp.initial_states.sample(40, 0)
+    bank = SolutionBank.of(ddp, ddp.solve(x0))
+    assert bank.periodic == (0,)
+    x = ocp.initial_states.sample(12, 1)
+    turned = x + 2 * np.pi * np.random.default_rng(0).integers(-3, 4, (12, 1)) * [1, 0]
+    np.testing.assert_array_equal(bank.nearest(turned), bank.nearest(x))
+    for a, b in zip(bank.interpolate(turned), bank.interpolate(x), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+    here, there = extend(ddp, bank, x), extend(ddp, bank, turned)
+    assert here.success.all()
+    np.testing.assert_allclose(there.cost, here.cost, rtol=1e-9)
+    np.testing.assert_allclose(there.u, here.u, atol=1e-7)
+
+
+def test_a_bank_knows_its_circles_after_a_save(tmp_path):
+    ocp = pendulum()
+    ddp = DDP(ocp, intervals=30)
+    bank = SolutionBank.of(ddp, ddp.solve(ocp.initial_states.sample(5, 0)))
+    bank.save(tmp_path)
+    assert SolutionBank.load(tmp_path).periodic == (0,)
+    assert bank.add(ddp.solve(ocp.initial_states.sample(5, 1))).periodic == (0,)
+
+
+def test_angles_of_a_sensor_are_followed():
+    """cartpole's cost tells turns apart: wrapped states give what continuous ones do, in Python and in CasADi."""
+    cnd = nocl.pretrained("cartpole")
+    assert cnd.continuous_angles == ("theta",)
+    t = np.linspace(0, 2, 41)
+    path = np.stack([0.3 * np.sin(t), np.cos(t), 3 + 2.5 * t, 2.5 + 0 * t], axis=1)  # theta passes pi and 2 pi
+    wrapped = path.copy()
+    wrapped[:, 2] = np.angle(np.exp(1j * path[:, 2]))
+    follow, f, last = cnd.unwrapped(), cnd.unwrapped_to_casadi(), path[0]
+    for x, seen, time in zip(path, wrapped, t, strict=True):
+        np.testing.assert_allclose(follow(seen, time), cnd(x, time), atol=1e-12)
+        u, last = f(seen, time, last)
+        np.testing.assert_allclose(u.full().ravel(), cnd(x, time), atol=1e-9)
+        np.testing.assert_allclose(last.full().ravel(), x, atol=1e-12)
+    np.testing.assert_allclose(follow(wrapped[0], 0.0), cnd(path[0], 0.0))  # an earlier time begins anew
+    rows = np.stack([path, path + [0, 0, 2 * np.pi, 0]], axis=1)
+    follow.reset()
+    np.testing.assert_allclose(follow(rows[0], 0.0), cnd(rows[0], 0.0))
+    np.testing.assert_allclose(follow(wrapped[[20, 20]], 1.0)[0],
+                               cnd(wrapped[20] + [0, 0, 2 * np.pi * np.round((path[0, 2] - wrapped[20, 2]) /
+                                                                            (2 * np.pi)), 0], 1.0))

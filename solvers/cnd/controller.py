@@ -23,6 +23,7 @@ from nocl.nets import FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.cnd.features import at_rate
 from nocl.solvers.cnd.labels import LONGEST
+from nocl.solvers.cnd.unwrapped import Unwrapped
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.translate.arguments import Arguments
@@ -59,6 +60,28 @@ class CND:
         with torch.no_grad():
             u = self.policy(*self._tensors(rows, t)).numpy()
         return u[0] if single else u
+
+    @property
+    def continuous_angles(self) -> tuple[str, ...]:
+        """Angles that it expects unwrapped: those in which the problem tells a turn from none."""
+        s = self.ocp.system
+        return tuple(s.state_names[i] for i in s.angle_indices if i not in self.ocp.periodic)
+
+    def unwrapped(self) -> Unwrapped:
+        """The same controller for angles in (-pi, pi], or in any other image: it follows them from call to call."""
+        return Unwrapped(self, self.ocp)
+
+    def unwrapped_to_casadi(self) -> ca.Function:
+        """unwrapped:(x [nx], t, last [nx]) -> (u [nu], continuous [nx]); `continuous` is the next call's `last`."""
+        pi, s = self.to_casadi(), self.ocp.system
+        at, last = Arguments.of(pi), ca.MX.sym("last", s.nx)
+        x, turn = at["x"], 2 * np.pi
+        for i in (s.state_names.index(name) for name in self.continuous_angles):
+            step = ca.MX.zeros(s.nx)
+            step[i] = turn * ca.floor((last[i] - at["x"][i]) / turn + 0.5)
+            x = x + step
+        return ca.Function("unwrapped", [at["x"], at["t"], last], [pi(x, at["t"]), x], ["x", "t", "last"],
+                           ["u", "continuous"])
 
     def at_rate(self, dt: float) -> CND:
         """The same controller for a sampling time dt [s]: u(x, t) is asked at multiples of dt and held until the next.

@@ -90,7 +90,7 @@ def at_other_rates(ddp: DDP, solution: Solution, unit: float, rng: np.random.Gen
 def tube(ddp: DDP, bank: SolutionBank, n: int, width: float, rng: np.random.Generator) -> Solution:
     """Tails from n random states near the bank's trajectories, each from the solution it is near."""
     rows, t0, x = tube_states(bank, n, width, ddp.ocp.horizon, rng)
-    return ddp.solve(x, t0, **bank.guess(rows, t0))
+    return ddp.solve(x, t0, **bank.guess(rows, t0, x))
 
 
 def tube_states(bank: SolutionBank, n: int, width: float, horizon: float,
@@ -128,7 +128,7 @@ def kicked_states(ocp: OCP, bank: SolutionBank, policy: torch.nn.Module, f: Fiel
 def answered(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, x: Array, t0: Array) -> Solution:
     """Tails from (x, t0): the better of a start from the policy's own answer and one from the nearest solution."""
     own = ddp.solve(x, t0, u=policy_controls(policy, f, x, t0, ddp.ocp.horizon, ddp.intervals, ddp.substeps))
-    near = ddp.solve(x, t0, **bank.guess(bank.nearest(x, t0)[:, 0], t0))
+    near = ddp.solve(x, t0, **bank.guess(bank.nearest(x, t0)[:, 0], t0, x))
     return better(own, near)
 
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import copy
 import os
+import sys
 import time
 import warnings
 from collections.abc import Iterator
@@ -178,7 +179,13 @@ class Training:
         if (remark := advice(self.history[-1], self.round - 1, s.held_out)) is not None:
             warnings.warn(f"{self.ocp.system.name}: {remark}", stacklevel=4)
         value = self._value() if s.value else None
-        return CND(self.ocp, self.net, value, self._card())
+        cnd = CND(self.ocp, self.net, value, self._card())
+        shown = sys.stderr.isatty() if self.hidden_progress is None else not self.hidden_progress
+        if shown and cnd.continuous_angles:
+            tqdm.write(f"{self.ocp.system.name}: the controller expects {', '.join(cnd.continuous_angles)} as a "
+                       "continuous angle, since the problem tells turns apart; cnd.unwrapped() takes it in (-pi, pi]",
+                       file=sys.stderr)
+        return cnd
 
     def _first_labels(self) -> None:
         s, rng = self.settings, self._rng(0)

@@ -29,6 +29,7 @@ class SolutionBank:
 
     solution: Solution
     scale: Array  # [nx], one unit of distance in each state
+    periodic: tuple[int, ...] = ()  # states that are the same 2 pi further (OCP.periodic): distances are to images
 
     def __len__(self) -> int:
         return len(self.solution)
@@ -48,7 +49,7 @@ class SolutionBank:
         if np.isnan(kept.gain).any():
             raise ValueError(f"a bank follows its solutions of {ddp.ocp.system.name} by their gain, which is NaN: "
                              "take those of DDP, or of NMPC.solve(x0, gains=True)")
-        return SolutionBank(replace(kept, tried=None, dense=None), spread(ddp.ocp, kept.x))
+        return SolutionBank(replace(kept, tried=None, dense=None), spread(ddp.ocp, kept.x), ddp.ocp.periodic)
 
     @staticmethod
     def from_arrays(ddp: DDP, arrays: dict[str, Any]) -> SolutionBank:
@@ -66,14 +67,15 @@ class SolutionBank:
         order = np.argsort(joined.cost, kind="stable")
         state = np.round(joined.x[order, 0] / (EQUAL * self.scale))
         kept = order[np.sort(np.unique(state, axis=0, return_index=True)[1])]
-        return SolutionBank(joined[np.sort(kept)], self.scale)
+        return SolutionBank(joined[np.sort(kept)], self.scale, self.periodic)
 
     def save(self, folder: str | os.PathLike[str]) -> Path:
         """Write folder/bank.safetensors, data only, atomically."""
         from nocl.support import store  # torch
 
         arrays = {name: value for name, value in self.solution.arrays().items() if name != "message"}
-        return store.save_checkpoint(Path(folder) / FILE, {"solution": arrays, "scale": self.scale}, {"kind": KIND})
+        return store.save_checkpoint(Path(folder) / FILE, {"solution": arrays, "scale": self.scale},
+                                     {"kind": KIND, "periodic": list(self.periodic)})
 
     @staticmethod
     def load(folder: str | os.PathLike[str]) -> SolutionBank:
@@ -86,7 +88,7 @@ class SolutionBank:
         state, meta = store.load_checkpoint(path)
         if meta.get("kind") != KIND:
             raise ValueError(f"{path} is no solution bank; expected a file of SolutionBank.save: name the right folder")
-        return SolutionBank(_solution(state["solution"]), state["scale"])
+        return SolutionBank(_solution(state["solution"]), state["scale"], tuple(meta.get("periodic", ())))
 
     def interpolate(self, x: ArrayLike, t: ArrayLike = 0.0) -> tuple[Array, Array, Array]:
         """(u, V, V_x) at states x [B, nx] and times t [B]: the nearest solution's, with u and V to first order in the
@@ -95,7 +97,8 @@ class SolutionBank:
         times = np.broadcast_to(np.asarray(t, dtype=np.float64), len(rows))
         near, s = self.nearest(rows, times)[:, 0], self.solution
         k = self._interval(times)
-        away = rows - self.states(near, times[:, None])[:, 0]
+        there = self.states(near, times[:, None])[:, 0]
+        away = rows - there - self._turns(rows, there)
         part = times * s.u.shape[1] / self.horizon - k
 
         def between(value: Array) -> Array:
@@ -120,15 +123,46 @@ class SolutionBank:
         interval = np.broadcast_to(self._interval(t), len(x))
         for k in np.unique(interval):
             here = interval == k
-            tree = KDTree(self.solution.x[:, k] / self.scale)
-            found[here] = tree.query(x[here] / self.scale, columns)[1]
+            tree = KDTree(self._on_circles(self.solution.x[:, k]), boxsize=self._circles)
+            found[here] = tree.query(self._on_circles(x[here]), columns)[1]
         return found
 
-    def guess(self, rows: Rows, t0: ArrayLike = 0.0) -> dict[str, Array]:
-        """What DDP.solve starts from: solutions `rows` [B] resampled onto their own [t0, T], as u, x and gain."""
+    def guess(self, rows: Rows, t0: ArrayLike = 0.0, x: Array | None = None) -> dict[str, Array]:
+        """What DDP.solve starts from: solutions `rows` [B] resampled onto their own [t0, T], as u, x and gain.
+
+        x : the states [B, nx] that are to be solved: of periodic states it is then the image near them
+        """
         start = np.broadcast_to(np.asarray(t0, dtype=np.float64), rows.shape)
         part = np.arange(self.solution.u.shape[1] + 1) / self.solution.u.shape[1]
-        return self._along(rows, start[:, None] + (self.horizon - start)[:, None] * part)
+        made = self._along(rows, start[:, None] + (self.horizon - start)[:, None] * part)
+        if x is not None and self.periodic:
+            made["x"] += self._turns(x, made["x"][:, 0])[:, None]
+        return made
+
+    def _turns(self, x: Array, there: Array) -> Array:
+        """The multiples of 2 pi [B, nx] by which x is further than `there` [B, nx], in periodic states."""
+        turns = np.zeros_like(x)
+        for i in self.periodic:
+            turns[:, i] = 2 * np.pi * np.round((x[:, i] - there[:, i]) / (2 * np.pi))
+        return turns
+
+    @property
+    def _circles(self) -> Array | None:
+        """The length of each scaled state's circle, 0 for none; None where there is no circle at all."""
+        if not self.periodic:
+            return None
+        size = np.zeros(len(self.scale))
+        size[list(self.periodic)] = 2 * np.pi / self.scale[list(self.periodic)]
+        return size
+
+    def _on_circles(self, x: Array) -> Array:
+        """Scaled states, the periodic ones on their circles."""
+        z, size = x / self.scale, self._circles
+        if size is not None:
+            for i in self.periodic:
+                z[:, i] %= size[i]
+                z[z[:, i] >= size[i], i] = 0.0  # the remainder of a tiny negative number rounds to the size
+        return z
 
     def _along(self, rows: Rows, times: Array) -> dict[str, Array]:
         k, row = self._interval(times[:, :-1] + np.diff(times) / 2), rows[:, None]
@@ -158,7 +192,7 @@ def extend(ddp: DDP, bank: SolutionBank, x0: ArrayLike, neighbours: int = 3, t0:
     rows, _ = checks.states(x0, ddp.ocp.system.nx, ddp.ocp.system.name)
     best: Solution | None = None
     for near in bank.nearest(rows, t0, count=neighbours).T:
-        solution = ddp.solve(rows, t0, **bank.guess(near, t0))
+        solution = ddp.solve(rows, t0, **bank.guess(near, t0, rows))
         best = solution if best is None else better(best, solution)
     assert best is not None
     return best
