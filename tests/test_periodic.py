@@ -135,7 +135,7 @@ def test_angles_of_a_sensor_are_followed():
         np.testing.assert_allclose(u.full().ravel(), cnd(x, time), atol=1e-9)
         np.testing.assert_allclose(last.full().ravel(), x, atol=1e-12)
     np.testing.assert_allclose(follow(wrapped[0], 0.0), cnd(path[0], 0.0))  # an earlier time begins anew
-    rows = np.stack([path, path + [0, 0, 2 * np.pi, 0]], axis=1)
+    rows = np.stack([path, path + np.array([0, 0, 2 * np.pi, 0])], axis=1)
     follow.reset()
     np.testing.assert_allclose(follow(rows[0], 0.0), cnd(rows[0], 0.0))
     np.testing.assert_allclose(follow(wrapped[[20, 20]], 1.0)[0],
