@@ -103,7 +103,7 @@ class Functions:
         at = Arguments.new(kind, **{n: s.numel() for n, s in self.arguments.symbols.items()})
         values = of_system(self.system, at)
         named = all(name in own.names for name in f.name_in())
-        given = [values[name] for name in (f.name_in() if named else own.names)]
+        given = [values[name] for name in (f.name_in() if named else own.names[:f.n_in()])]
         return at.function(f.name(), {"xdot": f(*given)})
 
     @cached_property

@@ -216,14 +216,10 @@ class OCP:
     @cached_property
     def kinks(self) -> tuple[str, ...]:
         """Where L, G or a path constraint is not smooth, in words."""
-        s, z, (low, high) = self.system, ca.vertcat(self.system.x, self.system.u), self._box_of_p
-        every = ca.vertcat(z, known.time(), self._all_p) if self.np or self.uses_time else z
-        n = every.numel() - z.numel()
-        lower = np.r_[s.lbx, s.lbu, np.r_[0.0, low][:n]]
-        upper = np.r_[s.ubx, s.ubu, np.r_[self.horizon, high][:n]]
-        parts = {"the running cost": self.running, "the terminal cost": self.terminal,
+        z, every = ca.vertcat(self.system.x, self.system.u), ca.vertcat(*self.functions.arguments.inputs)
+        parts = {"the running cost": self.running, "the terminal cost": self.functions.terminal,
                  **{f"path constraint {name!r}": h for name, h in self.path_constraints.items()}}
-        return tuple(f"{what} has {kink}" for what, e in parts.items() for kink in kinks(e, every, lower, upper, z))
+        return tuple(f"{what} has {kink}" for what, e in parts.items() for kink in kinks(e, every, *self.stage_box, z))
 
     @property
     def not_smooth(self) -> str:
@@ -277,8 +273,12 @@ class OCP:
         return np.where(np.isnan(given), self.parameters.centre, given)
 
     @property
-    def _box_of_p(self) -> tuple[Array, Array]:
-        return (np.zeros(0), np.zeros(0)) if self.parameters is None else box(self.parameters)
+    def stage_box(self) -> tuple[Array, Array]:
+        """(lower, upper) of (x, u[, t][, p]): X, U, [0, T] and where `parameters` lie."""
+        s = self.system
+        time = ([0.0], [self.horizon]) if self.uses_time else ([], [])
+        p = ([], []) if self.parameters is None else box(self.parameters)
+        return np.r_[s.lbx, s.lbu, time[0], p[0]], np.r_[s.ubx, s.ubu, time[1], p[1]]
 
     @cached_property
     def uses_time(self) -> bool:
