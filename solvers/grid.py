@@ -67,16 +67,17 @@ def measured(ocp: OCP, functions: Functions, solution: Solution, substeps: int) 
 def _errors(ocp: OCP, functions: Functions, s: Solution) -> Callable[[int], float]:
     """substeps -> the largest error."""
     B, K, nx = len(s), s.u.shape[1], s.x.shape[2]
-    x, u, h = s.x[:, :-1].reshape(-1, nx).T, s.u.reshape(B * K, -1).T, np.diff(s.t, axis=1).reshape(1, -1)
-    step = functions.step()
+    x, h = s.x[:, :-1].reshape(-1, nx).T, np.diff(s.t, axis=1).reshape(1, -1)
+    step, moment = functions.step(), _stages(functions, s)
     usual = usual_sizes(ocp)
     cost, slope = np.maximum(np.abs(s.cost), SMALL * usual.cost), s.V_x[:, 1:].reshape(-1, nx).T
     known: dict[int, float] = {}
 
     def after(n: int) -> tuple[Array, Array]:
         z, total = x, np.zeros((1, B * K))
-        for _ in range(n):
-            z, part = (v.full() for v in step(z, u, h / n))
+        for i in range(n):
+            now = {**moment, "x": z.T, "t": moment["t"] + (i * h / n).ravel()}
+            z, part = (v.full() for v in step(*functions.arguments.columns(**now), h / n))
             total = total + part
         return z, total
 
@@ -96,10 +97,18 @@ def _errors(ocp: OCP, functions: Functions, s: Solution) -> Callable[[int], floa
     return error
 
 
+def _stages(functions: Functions, s: Solution) -> dict[str, Array]:
+    """The start of each interval of all solutions, a row each: x, u, t, p."""
+    K = s.u.shape[1]
+    p = np.zeros((len(s), 0)) if s.p is None else s.p
+    return {"x": s.x[:, :-1].reshape(-1, s.x.shape[2]), "u": s.u.reshape(len(s) * K, -1), "t": s.t[:, :-1].ravel(),
+            "p": np.repeat(p, K, axis=0)}
+
+
 def _fastest(functions: Functions, s: Solution) -> float:
     """The shortest time constant of the linearised f at the solutions' nodes."""
     nx = s.x.shape[2]
-    A = functions.jacobian(s.x[:, :-1].reshape(-1, nx).T, s.u.reshape(-1, s.u.shape[2]).T)[0].full()
+    A = functions.jacobian(*functions.arguments.columns(**_stages(functions, s)))[0].full()
     A = A.reshape(nx, -1, nx).transpose(1, 0, 2)
     rate = np.abs(np.linalg.eigvals(A[np.isfinite(A).all(axis=(1, 2))]).real).max(initial=0.0)
     return float(1 / rate) if rate > 0 else np.inf

@@ -35,6 +35,7 @@ class Piece:
     first: int
     x0: Array  # [n, nx]
     t0: Array  # [n]
+    p: Array  # [n, np]
     guess: dict[str, Array]  # of u, x and gain, those that are given
     curvature: bool
 
@@ -82,11 +83,11 @@ def bytes_each(ddp: Descent, curvature: bool) -> int:
     return 8 * (K + 1) * (4 * nx + 4 * nu + 2 * nu * nx + 3 + (nx * nx if curvature else 0))
 
 
-def pieces(ddp: Descent, x0: Array, t0: Array, guess: dict[str, Array], curvature: bool) -> list[Piece]:
+def pieces(ddp: Descent, x0: Array, t0: Array, p: Array, guess: dict[str, Array], curvature: bool) -> list[Piece]:
     """Pieces of MOST problems, fewer where these would take more than BYTES; the same for any workers."""
     n = max(1, min(MOST, BYTES // bytes_each(ddp, curvature)))
-    return [Piece(f"piece-{i:09d}", i, x0[i:i + n], t0[i:i + n], {k: v[i:i + n] for k, v in guess.items()}, curvature)
-            for i in range(0, max(len(x0), 1), n)]
+    return [Piece(f"piece-{i:09d}", i, x0[i:i + n], t0[i:i + n], p[i:i + n],
+                  {k: v[i:i + n] for k, v in guess.items()}, curvature) for i in range(0, max(len(x0), 1), n)]
 
 
 def assembled(n: int, parts: Iterable[Solved]) -> Solution:
