@@ -49,6 +49,7 @@ def compare(ocp: OCP, methods: Mapping[str, Any], n: int = 100, x0: ArrayLike | 
     Raises ValueError for methods that are none, or are made for another problem.
     """
     checks.problem(ocp, "compare")
+    ocp.refuse_parameters("compare")
     states = initial_states(ocp, n, x0, seed)
     rates, folder = rates_of(hold), None if out is None else Path(out)
     start = time.perf_counter()

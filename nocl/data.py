@@ -47,6 +47,7 @@ class Dataset:
     @staticmethod
     def label(system: System, x: Array, u: Array) -> Dataset:
         """Exact labels at given rows x [N, nx], u [N, nu]."""
+        system.refuse_parameters("Dataset")
         n = len(x)
         A, B = (j.full() for j in system.jacobian(x.T, u.T))
         return Dataset(x, u, system.f(x.T, u.T).full().T, _blocks(A, n), _blocks(B, n))

@@ -307,7 +307,10 @@ class OCP:
 
     def at(self, p: Any = None) -> OCP:
         """The problem with its parameters folded in as constants: p as [np] or by name, each of them."""
-        value = self.parameters_of(p, 1, f"OCP on {self.system.name!r}, at")[0]
+        return self.folded(self.parameters_of(p, 1, f"OCP on {self.system.name!r}, at")[0])
+
+    def folded(self, value: Array) -> OCP:
+        """`at` parameters [np] that were checked."""
         if not self.np:
             return self
         x_goal, u_goal = (goal[0] for goal in self.goals(value[None]))
@@ -335,10 +338,10 @@ class OCP:
 
     def goals(self, p: Array) -> tuple[Array, Array]:
         """The goal pairs (x_goal [B, nx], u_goal [B, nu]) at parameters p [B, np]."""
-        if not self.goal_varies:
-            return tuple(np.tile(goal, (len(p), 1)) for goal in (self.x_goal, self.u_goal))  # type: ignore[return-value]
-        x, u = (np.broadcast_to(goal.full().T, (len(p), goal.numel() // goal.shape[1])).copy()
-                for goal in self.goal.map(len(p))(p.T))
+        if not self.goal_varies or not len(p):
+            x, u = (np.tile(np.asarray(goal), (len(p), 1)) for goal in (self.x_goal, self.u_goal))
+        else:
+            x, u = (goal.full().T for goal in self.goal(p.T))
         return x, u
 
     def from_goal(self, x: Any, p: Any = None) -> Any:
@@ -365,7 +368,7 @@ class OCP:
             return self.x_goal
         rows = np.asarray(p, dtype=np.float64)
         goal = self.goals(np.atleast_2d(rows))[0]
-        return goal[0] if rows.ndim == 1 else goal.reshape(len(goal), *[1] * (axes - 2), -1)
+        return goal[0] if rows.ndim == 1 else beside(goal, axes)
 
     def check_strict(self, owner: str) -> None:
         """ValueError where the Hamiltonian is linear in a control, so that second derivatives say nothing of it."""
@@ -504,6 +507,11 @@ class OCP:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return OCP.from_data, (self.to_data(),)  # bare SX does not pickle
+
+
+def beside(rows: Array, axes: int) -> Array:
+    """Rows [B, n] as they broadcast with an array [B, ..., n] of that many axes."""
+    return np.expand_dims(rows, tuple(range(1, axes - 1)))
 
 
 class Goal(np.ndarray[Any, np.dtype[np.float64]]):

@@ -288,6 +288,7 @@ def _check_arguments(system: System, method: str, settings: Settings | PaperSett
     if not isinstance(system, System):
         raise ValueError(f"identify: system is a {type(system).__name__}; expected a nocl.System: "
                          "of an OCP, pass ocp.system")
+    system.refuse_parameters("identify")
     if method not in RECIPES:
         raise ValueError(f"identify: method is {method!r}; expected one of {', '.join(RECIPES)}")
     if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:

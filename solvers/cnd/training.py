@@ -106,6 +106,7 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
 def _check(ocp: OCP, dynamics: LearnedDynamics | None, seed: int, out: str | os.PathLike[str] | None) -> None:
     if not isinstance(ocp, OCP):
         raise ValueError(f"train: ocp is a {type(ocp).__name__}; expected a nocl.OCP")
+    ocp.refuse_parameters("train")
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**62:
         raise ValueError(f"train: seed is {seed!r}; expected a whole number from 0 to 2**62")
     if out is not None and Path(out).exists() and not Path(out).is_dir():

@@ -140,7 +140,7 @@ class DDP:
         journal = Journal(None if out is None else Path(out),
                           self._run_key(rows, times, values, guess, curvature) if out else "", "DDP")
         show = sys.stderr.isatty() if progress is None else progress
-        tasks = pieces(self, rows, times, values, guess, curvature)
+        tasks = pieces(self, rows, times, guess, curvature, values)
         solution = assembled(len(rows), stream(Job(here), tasks, pool, journal, show, f"DDP, {self.ocp.system.name}"))
         self._check_grid(solution)
         return solution
@@ -157,7 +157,8 @@ class DDP:
 
     def descend(self, batch: Piece) -> Solution:
         """Solve one piece of a batch, here."""
-        work = Work(self, batch.x0, batch.t0, batch.p, *(batch.guess.get(name) for name in ("u", "x", "gain")))
+        given = batch.guess.get
+        work = Work(self, batch.x0, batch.t0, given("u"), given("x"), given("gain"), batch.p)
         work.descend()
         return work.solution(batch.curvature)
 
@@ -166,15 +167,15 @@ class DDP:
 
         p [B, np], where the problem has parameters.
         """
-        given, start = self._guesses(len(x0), **guess), (np.ascontiguousarray(x0), np.zeros(len(x0)))
-        work = Work(self, *start, self._values(p, len(x0)), *(given.get(k) for k in ("u", "x", "gain")))
+        given = self._guesses(len(x0), **guess).get
+        work = Work(self, np.ascontiguousarray(x0), np.zeros(len(x0)), given("u"), given("x"), given("gain"), p)
         return work.x
 
     def feedback(self, x: Array, u: Array, p: Array | None = None) -> Array:
         """Gains [B, K, nu, nx] of one sweep about x [B, K+1, nx], u [B, K, nu]: those of the OCP's cost, damped until
         it is convex there; 0 where no damping helps. p [B, np], where the problem has parameters."""
         B, s = len(x), self.settings
-        work = Work(self, np.ascontiguousarray(x[:, 0]), np.zeros(B), self._values(p, B), None, None, None)
+        work = Work(self, np.ascontiguousarray(x[:, 0]), np.zeros(B), None, None, None, p)
         work.x[:], work.u[:] = x, u
         rows = np.arange(B)
         while rows.size:
@@ -184,10 +185,6 @@ class DDP:
             work.gain[rows] = 0.0
             rows = rows[work.mu[rows] <= s.largest_damping]
         return work.gain
-
-    def _values(self, p: Array | None, B: int) -> Array:
-        """Checked parameters [B, np], of none where the problem has none."""
-        return np.zeros((B, 0)) if p is None else np.ascontiguousarray(p, dtype=np.float64)
 
     def _where(self, workers: int | str) -> tuple[Pool, DDP]:
         """The pool, and the DDP that works in it: on a cluster each worker's threads have pieces of their own."""
@@ -236,16 +233,17 @@ class Work:
     ddp: DDP
     x0: Array
     t0: Array
-    p: Array  # [B, np]
     guess_u: Array | None
     guess_x: Array | None
     guess_gain: Array | None
+    parameters: Array | None = None  # [B, np], where the problem has some
     mu: Array = field(init=False)
 
     def __post_init__(self) -> None:
         self.begin = time.perf_counter()
         ocp, B, K = self.ddp.ocp, len(self.x0), self.ddp.intervals
         nx, nu = ocp.system.nx, ocp.system.nu
+        self.p = np.zeros((B, 0)) if self.parameters is None else self.parameters
         self.h = (ocp.horizon - self.t0) / K
         self.x, self.u = np.zeros((B, K + 1, nx)), np.zeros((B, K, nu))
         self.k, self.gain = np.zeros((B, K, nu)), np.zeros((B, K, nu, nx))
