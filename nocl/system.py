@@ -216,10 +216,11 @@ class System:
         return replace(self, xdot=xdot, p=None, units=units)
 
     def difference(self, other: System, equations: bool = True) -> str:
-        """What tells another system from this one, names or (where asked) equations; "" where they are the same."""
+        """What tells another system from this one, names of states and controls or (where asked) parameters and
+        equations; "" where they are the same."""
+        parameters = [("parameters", self.parameter_names, other.parameter_names)] if equations else []
         for what, own, theirs in (("states", self.state_names, other.state_names),
-                                  ("controls", self.control_names, other.control_names),
-                                  ("parameters", self.parameter_names, other.parameter_names)):
+                                  ("controls", self.control_names, other.control_names), *parameters):
             if own != theirs:
                 return f"its {what} are {', '.join(theirs) or 'none'}, not {', '.join(own) or 'none'}"
         if not equations or self.xdot is None or other.xdot is None or self.xdot is other.xdot:

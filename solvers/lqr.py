@@ -51,8 +51,8 @@ class LQR:
     Of one problem: with parameters, that at given ones, LQR(ocp.at(p=...)).
 
     Raises ValueError where the problem holds the time or parameters, where the goal pair is no equilibrium of f, no
-    stationary point of L and G, where the Hessian of L in u is not positive definite, and (infinite) where (A, B) is not
-    stabilisable.
+    stationary point of L and G, where the Hessian of L in u is not positive definite, and (infinite) where (A, B) is
+    not stabilisable.
     """
 
     def __init__(self, ocp: OCP, infinite: bool = False) -> None:

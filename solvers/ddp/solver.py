@@ -386,7 +386,7 @@ def _fitting(ocp: OCP, dynamics: LearnedDynamics) -> Any:
     if not hasattr(dynamics, "net"):
         raise ValueError(f"DDP: dynamics is a {type(dynamics).__name__}; expected LearnedDynamics, as "
                          "nocl.identify gives it, or None for the exact f")
-    ours, theirs = ocp.system.names, dynamics.system.names
+    ours, theirs = ((*s.names, *s.parameter_names) for s in (ocp.system, dynamics.system))
     if ours != theirs:
         raise ValueError(f"DDP: dynamics was learned for {', '.join(theirs)}; the problem has {', '.join(ours)}")
     return dynamics.net

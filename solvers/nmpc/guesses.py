@@ -31,7 +31,7 @@ def starts(program: Transcription, lqr: LQR | None, x0: Array, t: Array, begin: 
     if begin + n > 1 and lqr is not None:
         found += lqr_rollout(program, lqr, x0, t, p)
     found.append((x0 + np.linspace(0.0, 1.0, N + 1)[:, None] * -ocp.from_goal(x0, row[0]), u_goal))
-    found += [(x, u_goal) for x in (sides(program, x0, t, p) if program.n_path else [])]
+    found += [(x, u_goal) for x in (sides(ocp, x0, N, t, p) if program.n_path else [])]
     random = (random_controls(ocp, N, 1, np.random.default_rng([seed, number]), row)[0]
               for number in range(max(begin, len(found)), begin + n))
     return found[begin:begin + n] + [controlled(program, x0, u, t, p) for u in random]
@@ -97,22 +97,26 @@ def controller_rollout(program: Transcription, controller: Controller, x0: Array
     return x, u
 
 
-def sides(program: Transcription, x0: Array, t: Array, p: Array | None = None) -> list[Array]:
-    """Lines from x0 to the goal [N+1, nx], bent round each obstacle that the straight one crosses, on either side."""
-    ocp, s, found = program.ocp, np.linspace(0.0, 1.0, program.N + 1)[:, None], list[Array]()
-    off, moment = ocp.from_goal(x0, p), program.moment(t, p)
-    line = x0 - s * off
+def sides(ocp: OCP, x0: Array, N: int, t: Array | None = None, p: Array | None = None) -> list[Array]:
+    """Lines from x0 to the goal [N+1, nx], bent round each obstacle that the straight one crosses, on either side.
+
+    The times t [N+1] of the nodes and parameters p [np], where the problem has them.
+    """
+    s, found, node = np.linspace(0.0, 1.0, N + 1)[:, None], list[Array](), ocp.functions.node
+    off = ocp.from_goal(x0, p)
+    line, times = x0 - s * off, np.zeros(N + 1) if t is None else t
     for i in range(len(ocp.path_constraints)):
-        values = ocp.h(line.T, *moment).full()[i]
+        values = ocp.h(*node.columns(x=line, t=times, p=p)).full()[i]
         k = int(np.argmin(values))
         if values[k] >= 0:
             continue
-        across = _across(ocp.functions.h_derivatives(line[k], *program.moment(t[k], p), 0)[1], i, -off)
+        slopes = ocp.functions.h_derivatives(*node.columns(x=line[k], t=times[k], p=p), 0)[1]
+        across = _across(slopes, i, -off)
         if across is None:
             continue
         for side in (across, -across):
             bent = (line + bulge * np.sin(np.pi * s) * side for bulge in BULGES)
-            found += [x for x in bent if ocp.h(x.T, *moment).full()[i].min() >= 0][:1]
+            found += [x for x in bent if ocp.h(*node.columns(x=x, t=times, p=p)).full()[i].min() >= 0][:1]
     return found
 
 
