@@ -154,4 +154,4 @@ def split_controls(system: System, names: Sequence[str]) -> System:
               if n in system.units}
     xdot = at.given(u=ca.vertcat(*value)).call(system.f)
     return System(f"{system.name}_split", x=at["x"], u=ca.vertcat(*parts), xdot=xdot, lbu=lb, ubu=ub, lbx=system.lbx,
-                  ubx=system.ubx, p=system.p, angles=system.angles, units=units)
+                  ubx=system.ubx, p=at.symbols.get("p"), angles=system.angles, units=units)
