@@ -241,9 +241,11 @@ static lane derivatives(const double *weights, const lane *x, const lane *u, DAT
         network_bend(weights, v, tape[j], bend);
         stage_hessian(s[j], u, NOW net[j], bend, mu + j * (N + 1), W + j * NW);
 #if defined(ND) && NP > 0
-        lane part[NP];
-        stage_parameters(s[j], u, now, net[j], bend, mu + j * (N + 1), part);
-        for (int i = 0; i < NP; ++i) by_p[i] += part[i];
+        if (by_p) {
+            lane part[NP];
+            stage_parameters(s[j], u, now, net[j], bend, mu + j * (N + 1), part);
+            for (int i = 0; i < NP; ++i) by_p[i] += part[i];
+        }
 #endif
     }
     step_derivatives(J, W, &h, F, l, H);
@@ -297,7 +299,7 @@ static void earlier(const lane *F, const lane *l, const lane *H, lane Q[NZ][NZ],
     }
 }
 
-/* Q and q of an interval from V at its end; returns its cost. Adds to dV/dp where there are parameters. */
+/* Q and q of an interval from V at its end; returns its cost. Adds to dV/dp where it is asked for. */
 static lane interval(const double *weights, const lane *x, const lane *u, DATA_IN lane h, const lane *Vx, const lane *Vxx,
                      lane Q[NZ][NZ], lane *q BY_P_IN)
 {
@@ -358,9 +360,9 @@ void nocl_backward(int64_t first, int64_t last, const int64_t *index, int64_t K,
         for (int i = 0; i < N; ++i) x[i] = gather(x_, at, (K + 1) * N, K * N + i);
         terminal(x, BEGIN V, Vx, Vxx);
 #ifdef ND
-        lane by_p[NP + 1];
+        lane sums[NP + 1], *by_p = by_p_ ? sums : 0;
 #if NP > 0
-        terminal_parameters(x, begin, by_p);
+        if (by_p) terminal_parameters(x, begin, by_p);
 #endif
 #endif
         for (int64_t t = K;; --t) {
@@ -387,7 +389,7 @@ void nocl_backward(int64_t first, int64_t last, const int64_t *index, int64_t K,
             value_update(Q, q, k, gain, Vx, Vxx);
         }
 #ifdef ND
-        if (by_p_) for (int i = 0; i < NP; ++i) scatter(by_p_, at, NP, i, by_p[i]);
+        if (by_p) for (int i = 0; i < NP; ++i) scatter(by_p_, at, NP, i, by_p[i]);
 #endif
         positive &= is_finite(slope) & is_finite(curve);
         scatter(slope_, at, 1, 0, slope);
