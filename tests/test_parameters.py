@@ -13,6 +13,7 @@ from scipy.integrate import solve_ivp
 
 import nocl
 from nocl import parameters
+from nocl.cli.commands import main
 from nocl.nets import MLP, FeatureNet
 from nocl.solvers import DDP, LQR, NMPC
 from nocl.solvers.ddp.bank import SolutionBank, extend
@@ -260,6 +261,25 @@ def test_what_has_no_parameters_yet_says_so(owner, use):
 def test_a_system_with_parameters_is_refused_where_nothing_is_done_with_them(use):
     with pytest.raises(ValueError, match=r"not implemented for the parameter\(s\) mass.*system.at\(p="):
         use(cart(timed=False).system)
+
+
+def test_the_command_line_refuses_them(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("nocl.cli.commands.load_ocp", lambda name: cart())
+    assert main(["solve", "cart"]) == 2
+    assert "the command line is not implemented for the parameter(s) mass, goal" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_folded_in_they_are_anybodys():
+    fixed = cart(timed=False).at(p=[0.9, 0.5])
+    assert nocl.to_control(fixed.system).nstates == 2
+    env = nocl.to_gymnasium(fixed, steps=4)
+    env.reset(options={"x0": X0[1]})
+    u = np.array([0.7])
+    rewards = sum(env.step(u)[1] for _ in range(4))
+    run = nocl.simulate(fixed, np.full((1, 4, 1), 0.7), X0[1])
+    assert -rewards == pytest.approx(run.cost[0], rel=1e-3)
 
 
 # Without parameters and time nothing changes: (of DDP's generated source, of to_data), as they were before these came

@@ -55,6 +55,7 @@ class Loop:
         self.plan: Solution | None = None
         self.begin = 0.0  # the time of the plan's first node
         self.asked: Array | None = None  # the states of the last call
+        self.p = np.zeros((0, nmpc.ocp.np))  # ... and their parameters [B, np]
         self.stats: list[dict[str, Any]] = []
 
     @property
