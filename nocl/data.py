@@ -100,6 +100,11 @@ class Solution:
     def __len__(self) -> int:
         return len(self.cost)
 
+    @property
+    def parameters(self) -> Array:
+        """p [B, np], with no columns where the problem has none."""
+        return np.zeros((len(self), 0)) if self.p is None else self.p
+
     @staticmethod
     def blank(t: Array, nx: int, nu: int, p: Array | None = None) -> Solution:
         """Rows without a solution yet, on the nodes t [B, K+1]; p [B, np], where the problem has parameters."""

@@ -16,7 +16,7 @@ from nocl import parameters as known
 from nocl import pretty, sampling
 from nocl.clearance import scales
 from nocl.functions import Functions
-from nocl.sampling import Distribution, Gaussian, Uniform, box, short
+from nocl.sampling import Distribution, Gaussian, Seed, Uniform, box, short
 from nocl.smoothness import kinks, linear_controls
 from nocl.support import checks
 from nocl.support.checks import MALFORMED, Array, Vector
@@ -138,7 +138,7 @@ class OCP:
 
     def _check_goal(self, owner: str) -> None:
         s = self.system
-        p = np.vstack([self.nominal, self._samples_of_p(SAMPLES)])
+        p = np.vstack([self.nominal, self.sample_parameters(SAMPLES)])
         x, u = self.goals(p)
         boxes = [(s.state_names, x, s.lbx, s.ubx, "x_goal"), (s.control_names, u, s.lbu, s.ubu, "u_goal")]
         for names, goals, lb, ub, what in boxes:
@@ -148,9 +148,14 @@ class OCP:
                 raise ValueError(f"{owner}: {what} has {names[i]} = {goals[row, i]:g}{self._at(p[row])}, outside its "
                                  f"box [{lb[i]:g}, {ub[i]:g}]: move the goal or widen the system's bounds")
 
-    def _samples_of_p(self, n: int) -> Array:
-        """n parameters of their distribution [n, np]."""
-        return np.zeros((n, 0)) if self.parameters is None else self.parameters.sample(n, 0)
+    def sample_parameters(self, n: int, seed: Seed = 0) -> Array:
+        """n parameters of their distribution [n, np]; nothing is drawn where there are none."""
+        return np.zeros((n, 0)) if self.parameters is None else self.parameters.sample(n, seed)
+
+    @property
+    def parameter_box(self) -> tuple[Array, Array]:
+        """Where parameters lie, [np] and [np]: of a Gaussian the usual range."""
+        return (np.zeros(0), np.zeros(0)) if self.parameters is None else box(self.parameters)
 
     def _at(self, p: Array) -> str:
         """Which parameters are meant, in words; "" where there are none."""
@@ -159,7 +164,7 @@ class OCP:
 
     def moments(self, n: int, seed: int = 0) -> dict[str, Array]:
         """n random times in [0, T] and parameters, as {"t": [n], "p": [n, np]}: for what is found out by trying."""
-        return {"t": np.random.default_rng([seed, 1]).uniform(0, self.horizon, n), "p": self._samples_of_p(n)}
+        return {"t": np.random.default_rng([seed, 1]).uniform(0, self.horizon, n), "p": self.sample_parameters(n)}
 
     def _check_initial_states(self, owner: str) -> None:
         d = self.initial_states
@@ -277,7 +282,7 @@ class OCP:
         """(lower, upper) of (x, u[, t][, p]): X, U, [0, T] and where `parameters` lie."""
         s = self.system
         time = ([0.0], [self.horizon]) if self.uses_time else ([], [])
-        p = ([], []) if self.parameters is None else box(self.parameters)
+        p = self.parameter_box
         return np.r_[s.lbx, s.lbu, time[0], p[0]], np.r_[s.ubx, s.ubu, time[1], p[1]]
 
     @cached_property
