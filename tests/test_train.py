@@ -233,7 +233,7 @@ def test_value_scores_are_zero_for_the_exact_value():
         return nocl.to_torch(ca.Function("V", [x, t], [x.T @ S @ x]))(X, T)
 
     policy = nocl.to_torch(ca.Function("u", [x, t], [-K @ x]))
-    f, optima = nocl.to_torch(ocp.system.f), {"initial": starts, "tails": starts}
+    optima = {"initial": starts, "tails": starts}
     row = value_scores(value, policy, InTorch(ocp), optima)
     assert row["tails_error"] < 1e-4
     assert row["tails_degrees"] < 0.1
@@ -399,7 +399,8 @@ def test_continuous_cost_is_the_judges(pendulum):
     policy, x0 = feedback(ocp), np.array([[0.2, 0.0], [0.1, -0.2], [-0.15, 0.3]])  # U is not reached: smooth
     run = simulate(ocp, nocl.CND(ocp, policy), x0)
     assert run.saturation.max() == 0
-    assert continuous_cost(policy, InTorch(ocp), Problems(x0, np.zeros(3), np.zeros((3, 0))), 400) == pytest.approx(run.cost, rel=1e-6)
+    cost = continuous_cost(policy, InTorch(ocp), Problems(x0, np.zeros(3), np.zeros((3, 0))), 400)
+    assert cost == pytest.approx(run.cost, rel=1e-6)
 
 
 def loss_parts(u_label):
@@ -407,8 +408,8 @@ def loss_parts(u_label):
     ocp = nocl.load_ocp("pendulum")
     rng = np.random.default_rng(0)
     n = len(u_label)
-    labels = Labels(rng.standard_normal((n, 2)), rng.uniform(0, 3, n), np.zeros((n, 0)), np.array(u_label)[:, None], np.ones(n),
-                    np.zeros(n))
+    labels = Labels(rng.standard_normal((n, 2)), rng.uniform(0, 3, n), np.zeros((n, 0)), np.array(u_label)[:, None],
+                    np.ones(n), np.zeros(n))
     net, inverse = policy_net(ocp, labels, (4,))
     answer = torch.nn.Linear(1, 1)  # stands for the network: whatever the features, it answers `y`
     answer.y = None

@@ -127,18 +127,13 @@ def tube_states(ocp: OCP, bank: SolutionBank, n: int, width: float,
     """(rows of the bank, n problems): x = x_row(t0) + width * exp(U(-1.5, 0)) * scale * N(0, I), and p likewise."""
     rows = rng.integers(0, len(bank), n)
     t0 = rng.uniform(0, 0.97 * ocp.horizon, n)
-    x = bank.states(rows, t0[:, None])[:, 0]
-    x += width * np.exp(rng.uniform(-1.5, 0, (n, 1))) * bank.scale * rng.standard_normal(x.shape)
-    return rows, Problems(x, t0, _near_parameters(ocp, bank.solution.parameters[rows], width, rng))
-
-
-def _near_parameters(ocp: OCP, p: Array, width: float, rng: np.random.Generator) -> Array:
-    """Parameters near p [n, np], inside of where they lie."""
-    if not ocp.np:
-        return p
-    low, high = ocp.parameter_box
-    away = width * np.exp(rng.uniform(-1.5, 0, (len(p), 1))) * (high - low) / 4 * rng.standard_normal(p.shape)
-    return np.clip(p + away, low, high)
+    x, p = bank.states(rows, t0[:, None])[:, 0], bank.solution.parameters[rows]
+    nx = x.shape[1]
+    x += width * np.exp(rng.uniform(-1.5, 0, (n, 1))) * bank.scale[:nx] * rng.standard_normal(x.shape)
+    if ocp.np:  # inside of where they lie
+        away = width * np.exp(rng.uniform(-1.5, 0, (n, 1))) * bank.scale[nx:] * rng.standard_normal(p.shape)
+        p = np.clip(p + away, *ocp.parameter_box)
+    return rows, Problems(x, t0, p)
 
 
 def visited(ddp: DDP, bank: SolutionBank, policy: Policy, torch_ocp: InTorch, n: int, kick: float,
@@ -153,7 +148,7 @@ def kicked_states(bank: SolutionBank, policy: Policy, torch_ocp: InTorch, n: int
     """n states, or fewer, that the policy visits under kicks, at any time: those not far out of the box."""
     ocp = torch_ocp.ocp
     start = Problems.initial(ocp, max(n // (2 if ocp.np else 8), 1), rng)
-    t, x = kicked_rollout(torch_ocp, policy, start, kick * bank.scale, rng, substeps=substeps)
+    t, x = kicked_rollout(torch_ocp, policy, start, kick * bank.scale[:ocp.system.nx], rng, substeps=substeps)
     rows, k = rng.integers(0, len(x), n), rng.integers(0, len(t) - 1, n)
     found = Problems(x[rows, k], t[k], start.p[rows])
     far = 10 * np.maximum(np.abs(ocp.system.lbx), np.abs(ocp.system.ubx))

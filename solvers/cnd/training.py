@@ -95,6 +95,7 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
     if method == "paper":
         chosen = _expect(settings, PaperSettings)
         checkpoint = None if out is None else Path(out) / CHECKPOINT
+        ocp.refuse_parameters("train(method='paper')")
         policy, value, card = train_paper(ocp, dynamics, chosen, seed=seed, progress=progress, checkpoint=checkpoint)
         return CND(ocp, policy, value, card)
     if method != "default":
@@ -106,7 +107,6 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
 def _check(ocp: OCP, dynamics: LearnedDynamics | None, seed: int, out: str | os.PathLike[str] | None) -> None:
     if not isinstance(ocp, OCP):
         raise ValueError(f"train: ocp is a {type(ocp).__name__}; expected a nocl.OCP")
-    ocp.refuse_parameters("train")
     if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**62:
         raise ValueError(f"train: seed is {seed!r}; expected a whole number from 0 to 2**62")
     if out is not None and Path(out).exists() and not Path(out).is_dir():
@@ -132,7 +132,8 @@ def substeps_for(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int) -> 
     while substeps <= TRIED[-1]:
         ddp = DDP(ocp, intervals=intervals, substeps=substeps, dynamics=dynamics, constraints="soft")
         ddp.checked = True
-        grid = measured(ocp, functions, ddp.solve(ocp.initial_states.sample(PROBES, 0)), substeps)
+        probes = Problems.initial(ocp, PROBES, np.random.default_rng([0, STREAM]))
+        grid = measured(ocp, functions, ddp.solve(probes.x, p=probes.given_p), substeps)
         if grid is not None and grid.needed == substeps:
             return substeps
         if grid is not None and grid.needed is None:
@@ -321,7 +322,7 @@ class Training:
     def _fit_value(self, net: FeatureNet, labels: ValueLabels, attempt: int) -> list[float]:
         s = self.settings
         iterations = s.value_iterations * (2 if attempt else 1)
-        loss = value_loss(net.float(), labels, self.bank.scale)
+        loss = value_loss(net.float(), labels, self.bank.scale[:self.ocp.system.nx])
         with self._stage("value function" + (", once more" if attempt else ""), iterations, fits=True) as bar:
             report = _Reporter(bar, iterations)
             fit_net(net, loss, len(labels), iterations=iterations, batch=s.batch, lr=s.lr, seed=self.seed + attempt,
