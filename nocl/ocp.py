@@ -240,7 +240,8 @@ class OCP:
         """What violations of each path constraint are measured by [number of them]: see nocl/clearance.py."""
         if not self.path_constraints:
             return np.zeros(0)
-        return scales(self.functions, np.vstack([self.initial_states.sample(PLACES, 0), self.x_goal]))
+        places = self.initial_states.sample(PLACES, sampling.own_numbers(0))
+        return scales(self.functions, np.vstack([places, self.x_goal]))
 
     def least(self, x: Array) -> Array:
         """The least value [B, number of them] of each path constraint along states x [B, n, nx]; inf for NaN."""

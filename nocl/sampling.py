@@ -11,6 +11,7 @@ import numpy as np
 from nocl.support.checks import Array, Vector, vector
 
 Seed = int | np.random.Generator
+STREAM = 0x6E6F636C  # nocl's own random numbers: never those of sample(n, seed), whatever the seed
 
 
 def _length(value: Vector, name: str, owner: str) -> int:
@@ -21,6 +22,11 @@ def _length(value: Vector, name: str, owner: str) -> int:
     if len(shape) != 1 or shape[0] == 0:
         raise ValueError(f"{owner}: {name} has shape {shape}, expected a vector: pass one number per state")
     return int(shape[0])
+
+
+def own_numbers(*key: int) -> np.random.Generator:
+    """Random numbers for what is no sample of the user's: the states of comparisons are never drawn."""
+    return np.random.default_rng([*key, STREAM])
 
 
 def short(vector: Array) -> str:

@@ -10,6 +10,7 @@ from functools import lru_cache
 import numpy as np
 
 from nocl.ocp import OCP
+from nocl.sampling import own_numbers
 from nocl.support.checks import Array
 
 SAMPLES = 256
@@ -27,8 +28,8 @@ class Sizes:
 
 @lru_cache(maxsize=32)
 def usual_sizes(ocp: OCP) -> Sizes:
-    s, rng = ocp.system, np.random.default_rng(0)
-    x = ocp.initial_states.sample(SAMPLES, 0)
+    s, rng = ocp.system, own_numbers(0)
+    x = ocp.initial_states.sample(SAMPLES, rng)
     u = rng.uniform(s.lbu, s.ubu, (SAMPLES, s.nu))
     J = np.abs(ocp.horizon * ocp.L(x.T, u.T).full()) + np.abs(ocp.G(x.T).full())
     J = J[np.isfinite(J) & (J > 0)]

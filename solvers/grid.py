@@ -24,6 +24,7 @@ ROWS = 4  # solutions that are looked at
 FINEST = 128  # steps in an interval, taken for the truth
 TRIED = (1, 2, 4, 8, 16, 32)  # substeps, in this order
 COARSE = 1e-2  # a larger error is worth a warning
+FINE = 1e-3  # training takes more substeps above it
 WANTED = 1e-4  # ... and a smaller one is what substeps are chosen for
 SMALL = 1e-3  # of the usual cost: below it, errors count as shares of that
 
@@ -47,8 +48,9 @@ class Grid:
         remedy = (f"with substeps={self.needed} plan and plant agree to {100 * self.then:.2g} %" if self.needed else
                   f"not even with substeps={TRIED[-1]} do plan and plant agree ({100 * self.then:.2g} %): more "
                   "intervals, or an equation for what settles at once in place of its dynamics")
-        return (f"the grid is too coarse for this system: its fastest time constant is {_time(self.fastest)}, a step "
-                f"{_time(self.step / self.substeps)}, and plan and plant differ by {100 * self.error:.2g} %; {remedy}")
+        mode = f"its fastest time constant is {_time(self.fastest)}, " if np.isfinite(self.fastest) else ""
+        return (f"the grid is too coarse for this system: {mode}a step {_time(self.step / self.substeps)}, "
+                f"and plan and plant differ by {100 * self.error:.2g} %; {remedy}")
 
 
 def measured(ocp: OCP, functions: Functions, solution: Solution, substeps: int) -> Grid | None:

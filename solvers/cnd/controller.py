@@ -80,8 +80,7 @@ class CND:
             step = ca.MX.zeros(s.nx)
             step[i] = turn * ca.floor((last[i] - at["x"][i]) / turn + 0.5)
             x = x + step
-        return ca.Function("unwrapped", [at["x"], at["t"], last], [pi(x, at["t"]), x], ["x", "t", "last"],
-                           ["u", "continuous"])
+        return at.function("unwrapped", {"u": at.given(x=x).call(pi), "continuous": x}, last=last)
 
     def at_rate(self, dt: float) -> CND:
         """The same controller for a sampling time dt [s]: u(x, t) is asked at multiples of dt and held until the next.

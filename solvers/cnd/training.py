@@ -30,6 +30,7 @@ from tqdm import tqdm
 from nocl.data import Solution
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
+from nocl.sampling import own_numbers
 from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.features import at_rate, policy_net
 from nocl.solvers.cnd.identity import identity
@@ -52,7 +53,7 @@ from nocl.solvers.cnd.value import ValueLabels, on_fine_grid, value_loss, value_
 from nocl.solvers.ddp.bank import SolutionBank, extend
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP
-from nocl.solvers.grid import TRIED, measured
+from nocl.solvers.grid import FINE, TRIED, measured
 from nocl.support import store
 from nocl.support.checks import Array
 from nocl.support.threads import one_thread
@@ -68,7 +69,6 @@ VALUE_LARGE = 0.05  # mean |V - J*| / J* that a warning is given above
 VALUE_HELD_OUT = 16  # times held_out: a mean of relative errors hangs on the few states that are hard
 LOSSES = 40  # of each regression that the card keeps
 PROBES = 8  # initial states that substeps are chosen on
-STREAM = 0x6E6F636C  # training's own random numbers: never those of initial_states.sample(n, seed), whatever the seeds
 
 
 def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "default",
@@ -131,8 +131,8 @@ def substeps_for(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int) -> 
     while substeps <= TRIED[-1]:
         ddp = DDP(ocp, intervals=intervals, substeps=substeps, dynamics=dynamics, constraints="soft")
         ddp.checked = True
-        grid = measured(ocp, functions, ddp.solve(ocp.initial_states.sample(PROBES, 0)), substeps)
-        if grid is not None and grid.needed == substeps:
+        grid = measured(ocp, functions, ddp.solve(ocp.initial_states.sample(PROBES, own_numbers(0))), substeps)
+        if grid is not None and grid.error <= FINE:
             return substeps
         if grid is not None and grid.needed is None:
             warnings.warn(f"{ocp.system.name}: {grid}", stacklevel=5)
@@ -349,7 +349,7 @@ class Training:
         self.fitting_cpu += (time.process_time() - cpu) * fits
 
     def _rng(self, stage: int) -> np.random.Generator:
-        return np.random.default_rng([self.seed, stage, STREAM])
+        return own_numbers(self.seed, stage)
 
     def _identity(self) -> str:
         return identity(self.ocp, self.settings, self.seed, self.f)
