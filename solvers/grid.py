@@ -5,10 +5,14 @@ and says that it costs, has nothing to do with the plant, and a descent even loo
 are followed again, interval by interval, each from its own nodes: an unstable plant does no harm. What counts is by how
 much of X a state is off after an interval, and by how much of J the cost is, to first order: errors of states count by
 the costate there, and add up with those of the running cost.
+
+Where it is left to a solver (substeps=None) it takes one Runge-Kutta step in each interval, and more where that is too
+coarse, as many as its first solutions ask for.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -40,6 +44,11 @@ class Grid:
     fastest: float  # time constant of f along the solutions; inf for none
 
     @property
+    def enough(self) -> int:
+        """The substeps to go on with."""
+        return self.needed or TRIED[-1]
+
+    @property
     def coarse(self) -> bool:
         return not self.error <= COARSE
 
@@ -61,7 +70,44 @@ def measured(ocp: OCP, functions: Functions, solution: Solution, substeps: int) 
     more = [n for n in TRIED if n >= substeps]
     needed = next((n for n in more if error(n) <= WANTED), None) if now > WANTED else substeps
     step = float(np.diff(solution.t, axis=1).max())
-    return Grid(step, substeps, now, needed, error(needed or TRIED[-1]), _fastest(functions, solution))
+    x, u = solution.x[:, :-1].reshape(-1, ocp.system.nx), solution.u.reshape(-1, ocp.system.nu)
+    return Grid(step, substeps, now, needed, error(needed or TRIED[-1]), fastest(functions, x, u))
+
+
+def settled(owner: str, ask: Callable[[int], Grid | None], stiff: Callable[[], bool],
+            tolerance: float = COARSE) -> int:
+    """The substeps with which solutions are off by `tolerance` at most; a warning says where 1 is far from enough.
+
+    ask : substeps -> the grid of solutions with so many; None where nothing was solved
+    stiff : whether f is fast beside a step: then more are tried where nothing was solved, since that may be why
+    """
+    found, substeps = dict[int, Grid | None](), 1
+    while substeps not in found:
+        grid = found[substeps] = ask(substeps)
+        if grid is None and not stiff():
+            break
+        if grid is not None:
+            substeps = substeps if grid.error <= tolerance else grid.enough
+        else:
+            substeps = min(4 * substeps, TRIED[-1])
+    known = [grid for grid in found.values() if grid is not None]
+    if not known:
+        return 1  # whoever solves says why nothing can be
+    substeps = known[-1].substeps
+    if known[-1].coarse:
+        warnings.warn(f"{owner}: {known[-1]}", stacklevel=4)
+    elif len(found) > 1 and found[1] is None:
+        warnings.warn(f"{owner}: with one Runge-Kutta step in an interval nothing was solved; {substeps} are taken, "
+                      f"and plan and plant agree to {100 * known[-1].error:.2g} %", stacklevel=4)
+    elif known[0].coarse:
+        warnings.warn(f"{owner}: {known[0]}, so they are taken", stacklevel=4)
+    return substeps
+
+
+def stiff(ocp: OCP, functions: Functions, step: float) -> bool:
+    """Whether f at initial states under u* is faster than explicit steps of this length follow well."""
+    x = ocp.initial_states.sample(ROWS, 0)
+    return bool(step > fastest(functions, x, np.tile(ocp.u_goal, (ROWS, 1))))
 
 
 def _errors(ocp: OCP, functions: Functions, s: Solution) -> Callable[[int], float]:
@@ -96,10 +142,10 @@ def _errors(ocp: OCP, functions: Functions, s: Solution) -> Callable[[int], floa
     return error
 
 
-def _fastest(functions: Functions, s: Solution) -> float:
-    """The shortest time constant of the linearised f at the solutions' nodes."""
-    nx = s.x.shape[2]
-    A = functions.jacobian(s.x[:, :-1].reshape(-1, nx).T, s.u.reshape(-1, s.u.shape[2]).T)[0].full()
+def fastest(functions: Functions, x: Array, u: Array) -> float:
+    """The shortest time constant of the linearised f at states x [n, nx] under controls u [n, nu]; inf for none."""
+    nx = x.shape[1]
+    A = functions.jacobian(x.T, u.T)[0].full()
     A = A.reshape(nx, -1, nx).transpose(1, 0, 2)
     rate = np.abs(np.linalg.eigvals(A[np.isfinite(A).all(axis=(1, 2))]).real).max(initial=0.0)
     return float(1 / rate) if rate > 0 else np.inf

@@ -8,9 +8,10 @@ import pytest
 
 import nocl
 from nocl.solvers import DDP, NMPC
-from nocl.solvers.cnd.training import substeps_for
+from nocl.solvers.ddp.solver import substeps_for
 from nocl.solvers.ddp.without_compiler import NumpyKernel
 from nocl.solvers.grid import COARSE, TRIED, WANTED, measured
+from nocl.solvers.nmpc.solver import shared_program
 from nocl.systems import NAMES
 
 X0 = np.array([1.0, 0.0])
@@ -72,11 +73,46 @@ def test_a_grid_that_is_too_coarse_is_told_by_both_solvers_and_what_helps_helps(
         judged = nocl.simulate(ocp, fine.u, X0).cost[0]
         assert fine.cost[0] == pytest.approx(judged, rel=1e-3)
         assert judged == pytest.approx({54.0: 0.02523, 60.0: 0.02522, 150.0: 0.02519}[rate], rel=1e-3)
-    assert substeps_for(ocp, None, 80) >= grid.needed
+    assert substeps_for(ocp, None, 80, WANTED) > 1
+
+
+@pytest.mark.parametrize("rate", [60.0, 1000.0])
+@pytest.mark.parametrize("make", [lambda ocp: DDP(ocp), lambda ocp: NMPC(ocp, 80, starts=2, passes=0)])
+def test_left_to_themselves_solvers_take_as_many_as_the_plant_asks_for(make, rate, tmp_path):
+    ocp = lag(rate)
+    shared_program.cache_clear()  # NMPC says it once for each program
+    with pytest.warns(UserWarning, match=r"too coarse .* so they are taken|nothing was solved; \d+ are taken"):
+        found = make(ocp).solve(X0)
+    judged = nocl.simulate(ocp, found.u, X0).cost[0]
+    assert found.cost[0] == pytest.approx(judged, rel=1e-3)
+    assert judged == pytest.approx({60.0: 0.02522, 1000.0: 0.025187}[rate], rel=1e-3)
+    with warnings.catch_warnings():  # remembered, and resumed from a folder
+        warnings.simplefilter("error")
+        again = make(ocp).solve(X0 + 0.01)
+    assert nocl.simulate(ocp, again.u, X0 + 0.01).cost[0] == pytest.approx(again.cost[0], rel=1e-3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        kept = [make(lag(rate)).solve(X0, out=tmp_path) for _ in range(2)]
+    assert kept[0].cost == kept[1].cost == pytest.approx(found.cost, rel=1e-6)
+
+
+def test_nmpc_tells_its_program_with_the_substeps_that_were_chosen():
+    shared_program.cache_clear()
+    nmpc = NMPC(lag(60.0), 40, starts=1, passes=0)
+    assert nmpc.settled.substeps == 1
+    with pytest.warns(UserWarning, match="so they are taken"):
+        found = nmpc.solve(X0, gains=True, workers=1)
+    assert nmpc.settled.substeps == nmpc.program.substeps > 1
+    assert np.isfinite(found.gain).all()
+    x, cost = X0, 0.0
+    for k in range(40):
+        x, part = (v.full().ravel() for v in nmpc.program.step(x, found.u[0, k], 0.1))
+        cost += part[0]
+    assert found.cost[0] == pytest.approx(cost + 5 * x[0]**2 + x[1]**2, rel=1e-6)
 
 
 def test_it_is_told_once():
-    ddp = DDP(lag(60.0))
+    ddp = DDP(lag(60.0), substeps=1)
     with pytest.warns(UserWarning, match="substeps="):
         ddp.solve(X0)
     with warnings.catch_warnings():
@@ -96,5 +132,5 @@ def test_what_no_explicit_step_can_follow_is_said_to_be():
 @pytest.mark.parametrize("name", NAMES)
 def test_the_problems_that_come_with_nocl_need_one_step(name):
     ocp = nocl.load_ocp(name)
-    assert substeps_for(ocp, None, 80) == 1
+    assert substeps_for(ocp, None, 80, WANTED) == 1
     assert WANTED < COARSE

@@ -94,6 +94,10 @@ class GlobalDDP:
     starts: int = 16
     seed: int = 0
 
+    @property
+    def substeps(self) -> int:
+        return self.ddp.substeps
+
     def solve(self, x0: ArrayLike, workers: int | str = "auto", out: str | os.PathLike[str] | None = None,
               progress: bool | None = None) -> Solution:
         return solve_globally(self.ddp, x0, starts=self.starts, seed=self.seed, workers=workers, out=out,

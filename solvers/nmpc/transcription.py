@@ -246,9 +246,9 @@ class Transcription:
         return [0.0]  # seconds of the slowest solve that came back
 
     @cached_property
-    def checked(self) -> list[bool]:
-        """Not empty once its grid was held against the plant."""
-        return []
+    def settled(self) -> dict[str, int]:
+        """`substeps` that its first solutions have asked for, once they were held against the plant."""
+        return {}
 
     @cached_property
     def _guarded(self) -> Guarded:
