@@ -10,8 +10,9 @@ import nocl
 from nocl.solvers import DDP, NMPC
 from nocl.solvers.ddp.solver import substeps_for
 from nocl.solvers.ddp.without_compiler import NumpyKernel
-from nocl.solvers.grid import COARSE, TRIED, WANTED, measured
+from nocl.solvers.grid import measured
 from nocl.solvers.nmpc.solver import shared_program
+from nocl.substeps import COARSE, TRIED, WANTED
 from nocl.systems import NAMES
 
 X0 = np.array([1.0, 0.0])

@@ -52,7 +52,7 @@ from nocl.solvers.cnd.value import ValueLabels, on_fine_grid, value_loss, value_
 from nocl.solvers.ddp.bank import SolutionBank, extend
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP, substeps_for
-from nocl.solvers.grid import WANTED
+from nocl.substeps import WANTED
 from nocl.support import store
 from nocl.support.checks import Array
 from nocl.support.threads import one_thread

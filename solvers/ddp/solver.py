@@ -31,7 +31,8 @@ from nocl.ocp import OCP
 from nocl.solvers.ddp.batch import Job, Piece, Rows, assembled, pieces
 from nocl.solvers.ddp.kernel import ddp_source, pack_weights
 from nocl.solvers.ddp.without_compiler import ddp_kernel
-from nocl.solvers.grid import COARSE, ROWS, Grid, measured, settled, stiff
+from nocl.solvers.grid import ROWS, measured, stiff
+from nocl.substeps import COARSE, Grid, settled
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.support.fields import Checked, count, positive
@@ -73,7 +74,7 @@ class DDP:
         K, the number of held controls on [t0, T].
     substeps : int, optional
         RK4 steps in each interval. Default: 1, or where a few solutions from the OCP's initial states show that this is
-        too coarse for the plant, as many as they ask for (nocl/solvers/grid.py); a warning says so.
+        too coarse for the plant, as many as they ask for (nocl/substeps.py); a warning says so.
     dynamics : LearnedDynamics, optional
         f_theta in place of the exact f; its networks' derivatives are generated C too.
     constraints : "hard" or "soft"

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from nocl.data import Solution, Trajectory
 from nocl.judge import check_made_for, dynamics_function
 from nocl.ocp import OCP
-from nocl.solvers.grid import Grid, measured, settled, stiff
+from nocl.solvers.grid import measured, stiff
 from nocl.solvers.lqr import LQR
 from nocl.solvers.mirrors import Mirror, mirrors
 from nocl.solvers.nmpc import guesses as starting
@@ -29,6 +29,7 @@ from nocl.solvers.nmpc.sensitivity import cost_to_go, dense, second_variation
 from nocl.solvers.nmpc.tasks import Outcome, Task, attempt, failure, outside, solved_by, violated_start
 from nocl.solvers.nmpc.transcription import BACKENDS, Answer, Transcription
 from nocl.solvers.search import Found, Moves, Rows, Search
+from nocl.substeps import Grid, settled
 from nocl.support import checks, compiler
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
@@ -48,7 +49,7 @@ class NMPC:
     dynamics : casadi.Function (x, u) -> xdot, or an object with `to_casadi()`; default: the exact f
     solver : "fatrop" (fast) or "ipopt" (reference); another nlpsol of CasADi's by its name
     substeps : RK4 steps in each interval; default: 1, or where the first solutions show that this is too coarse for the
-        plant, as many as they ask for (nocl/solvers/grid.py); a warning says so
+        plant, as many as they ask for (nocl/substeps.py); a warning says so
     horizon : length of the window that is optimised, at most the OCP's horizon T (default); it ends at T at the latest
     terminal : cost at the window's end in place of G: a casadi.Function (x) or (x, t) -> number, or an object with
         `value_to_casadi()`, such as a trained value function
