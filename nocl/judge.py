@@ -276,7 +276,7 @@ class _Judge:
     def integrate(self, solver: ca.Function, z: Array, p: Any) -> tuple[Array | None, float]:
         """(states at the solver's times, last quadrature), or None where CVODES fails or yields NaN."""
         try:
-            with interrupt.deferred():
+            with interrupt.kept():
                 result = solver(x0=z / self.unit, p=p)
         except RuntimeError:
             return None, np.nan

@@ -1,10 +1,12 @@
 """Steps that are too long for a plant: found, told, and cured by substeps, which all solvers share."""
 
 import warnings
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
 import pytest
+import torch
 
 import nocl
 from nocl.solvers import DDP, NMPC
@@ -13,6 +15,7 @@ from nocl.solvers.ddp.without_compiler import NumpyKernel
 from nocl.solvers.grid import measured
 from nocl.solvers.nmpc.solver import shared_program
 from nocl.substeps import COARSE, TRIED, WANTED
+from nocl.sysid.settings import LogSettings
 from nocl.systems import NAMES
 
 X0 = np.array([1.0, 0.0])
@@ -135,3 +138,26 @@ def test_the_problems_that_come_with_nocl_need_one_step(name):
     ocp = nocl.load_ocp(name)
     assert substeps_for(ocp, None, 80, WANTED) == 1
     assert WANTED < COARSE
+
+
+def test_a_log_whose_samples_are_far_apart_is_fitted_by_shorter_steps():
+    """The actuator settles in 33 ms, a sample comes every 50 ms: one Runge-Kutta step is 6 % off."""
+    s, h, K = lag(30.0).system, 0.05, 40
+    step = ca.integrator("step", "cvodes", {"x": s.x, "p": s.u, "ode": s.xdot}, 0, h, {"reltol": 1e-10})
+    t, x, u = np.arange(K + 1) * h, np.zeros((3, K + 1, 2)), np.zeros((3, K + 1, 1))
+    for run in range(3):
+        u[run, :, 0] = 0.7 * np.sin(2 * t + run) + 0.3 * np.sin(9 * t - run)
+        for k in range(K):
+            x[run, k + 1] = step(x0=x[run, k], p=u[run, k])["xf"].full().ravel()
+    log = nocl.Log.of(s, np.tile(t, 3), x.reshape(-1, 2), u.reshape(-1, 1), run=np.repeat(np.arange(3), K + 1))
+    given = {"known": {"x": "z"}, "control_affine": True}
+    settings = LogSettings.of("quick", window=4, steps=25)
+    with pytest.warns(UserWarning, match="identify: the grid is too coarse .* so it is fitted again"):
+        model = nocl.identify(s, data=log, settings=settings, **given)
+    with pytest.warns(UserWarning, match=r"with substeps=\d"):
+        coarse = nocl.identify(s, data=log, settings=replace(settings, substeps=1), **given)
+    assert (model.card["substeps"], coarse.card["substeps"]) == (4, 1)
+    errors = [m.validate(log, (1,)).relative[0] for m in (model, coarse)]
+    assert errors[0] < 0.5 * errors[1]
+    at = torch.tensor([[0.0, 0.3]], dtype=torch.float64), torch.tensor([[0.0]], dtype=torch.float64)
+    assert model(*at)[0, 1].item() == pytest.approx(-9.0, rel=0.1)

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.func import jacrev, vmap
 
 from nocl.nets import MLP, FeatureNet
-from nocl.substeps import FINEST, Grid, grid_of, settled
+from nocl.substeps import FINEST, Grid, grid_of
 from nocl.support.checks import Array
 from nocl.sysid import fitting
 from nocl.sysid.logs.derivatives import labels
@@ -30,6 +30,7 @@ from nocl.sysid.structure import Structure
 from nocl.translate.rk4 import rk4_interval
 
 MEMORY = 30  # of L-BFGS
+MOST = 8  # steps that are chosen: each costs as much as one
 SAMPLES = 1000  # of a log, about, that the length of steps is judged on
 
 
@@ -67,12 +68,13 @@ def _fit_simulation(net: FeatureNet, unit: Array, log: Log, settings: LogSetting
                                            rng=np.random.default_rng((seed, 3)), report=report)
         return steps_of(net, log, substeps)
 
-    if settings.substeps is None:
-        return stages, settled("identify", ask, lambda: False)
-    grid = ask(settings.substeps)
+    grid = ask(settings.substeps or 1)
+    again = grid.needed if grid.coarse and settings.substeps is None else None
     if grid.coarse:
-        warnings.warn(f"identify: {grid}", stacklevel=6)
-    return stages, settings.substeps
+        warnings.warn(f"identify: {grid}{', so it is fitted again' if again else ''}", stacklevel=6)
+    if again:
+        grid = ask(again := min(again, MOST))
+    return stages, again or grid.substeps
 
 
 def steps_of(net: FeatureNet, log: Log, substeps: int) -> Grid:
