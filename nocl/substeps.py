@@ -14,6 +14,7 @@ FINEST = 128  # steps in an interval, taken for the truth
 TRIED = (1, 2, 4, 8, 16, 32)  # substeps, in this order
 COARSE = 1e-2  # a larger error is worth a warning
 WANTED = 1e-4  # ... and a smaller one is what substeps are chosen for
+REMEDY = "more intervals, or an equation for what settles at once in place of its dynamics"
 
 
 @dataclass(frozen=True)
@@ -39,8 +40,8 @@ class Grid:
 
     def __str__(self) -> str:
         remedy = (f"with substeps={self.needed} {self.parts} agree to {100 * self.then:.2g} %" if self.needed else
-                  f"not even with substeps={TRIED[-1]} do {self.parts} agree ({100 * self.then:.2g} %): more "
-                  "intervals, or an equation for what settles at once in place of its dynamics")
+                  f"not even with substeps={TRIED[-1]} do {self.parts} agree ({100 * self.then:.2g} %): "
+                  f"{REMEDY}")
         return (f"the grid is too coarse for this system: its fastest time constant is {_time(self.fastest)}, a step "
                 f"{_time(self.step / self.substeps)}, and {self.parts} differ by {100 * self.error:.2g} %; {remedy}")
 
@@ -54,17 +55,18 @@ def grid_of(step: float, substeps: int, error: Callable[[int], float], fastest: 
     return Grid(step, substeps, now, needed, error(needed or TRIED[-1]), fastest, parts)
 
 
-def settled(owner: str, ask: Callable[[int], Grid | None], stiff: Callable[[], bool],
+def settled(owner: str, ask: Callable[[int], Grid | None], step: float, fastest: Callable[[], float],
             tolerance: float = COARSE) -> int:
     """The substeps with which solutions are off by `tolerance` at most; a warning says where 1 is far from enough.
 
     ask : substeps -> the grid of solutions with so many; None where nothing was solved
-    stiff : whether f is fast beside a step: then more are tried where nothing was solved, since that may be why
+    step, fastest : length of an interval, and time constant of f where solutions begin; where it is the shorter one
+        and nothing was solved, that may be why, and more substeps are tried
     """
     found, substeps = dict[int, Grid | None](), 1
     while substeps not in found:
         grid = found[substeps] = ask(substeps)
-        if grid is None and not stiff():
+        if grid is None and fastest() >= step:
             break
         if grid is not None:
             substeps = substeps if grid.error <= tolerance else grid.enough
@@ -72,6 +74,9 @@ def settled(owner: str, ask: Callable[[int], Grid | None], stiff: Callable[[], b
             substeps = min(4 * substeps, TRIED[-1])
     known = [grid for grid in found.values() if grid is not None]
     if not known:
+        if len(found) > 1:
+            warnings.warn(f"{owner}: nothing was solved, not even with substeps={substeps}: the fastest time constant "
+                          f"is {_time(fastest())}, an interval {_time(step)}; {REMEDY}", stacklevel=4)
         return 1  # whoever solves says why nothing can be
     substeps = known[-1].substeps
     if known[-1].coarse:

@@ -34,10 +34,9 @@ def measured(ocp: OCP, functions: Functions, solution: Solution, substeps: int) 
     return grid_of(step, substeps, _errors(ocp, functions, solution), fastest(functions, x, u))
 
 
-def stiff(ocp: OCP, functions: Functions, step: float) -> bool:
-    """Whether f at initial states under u* is faster than explicit steps of this length follow well."""
-    x = ocp.initial_states.sample(ROWS, 0)
-    return bool(step > fastest(functions, x, np.tile(ocp.u_goal, (ROWS, 1))))
+def fastest_at_start(ocp: OCP, functions: Functions) -> float:
+    """The shortest time constant of f at some initial states under u*."""
+    return fastest(functions, ocp.initial_states.sample(ROWS, 0), np.tile(ocp.u_goal, (ROWS, 1)))
 
 
 def _errors(ocp: OCP, functions: Functions, s: Solution) -> Callable[[int], float]:

@@ -87,7 +87,8 @@ class LQR:
                              "scale the states and costs")
         fine = np.linspace(0, 1, REFINE, endpoint=False)
         s = np.r_[(path.t[:-1, None] + np.diff(path.t)[:, None] * fine).ravel(), T]
-        spline = make_interp_spline(T - s[::-1], path.sol(s).T[::-1], k=DEGREE)
+        t = np.unique(T - s)  # next to T the first steps of a stiff one may be less than rounding apart
+        spline = make_interp_spline(t, path.sol(T - t).T, k=DEGREE)
         return BSpline(spline.t, spline.c * of.unit.ravel(), DEGREE)
 
     def _solve_infinite(self) -> Array:

@@ -104,9 +104,9 @@ class GlobalDDP:
                               progress=progress)
 
 
-def global_ddp(ocp: OCP, intervals: int, seed: int) -> GlobalDDP:
+def global_ddp(ocp: OCP, intervals: int, seed: int, substeps: int | None = None) -> GlobalDDP:
     """DDP from everywhere, as the command line makes it."""
-    return GlobalDDP(DDP(ocp, intervals=intervals), seed=seed)
+    return GlobalDDP(DDP(ocp, intervals=intervals, substeps=substeps), seed=seed)
 
 
 class _Kept(Search):

@@ -31,7 +31,7 @@ from nocl.ocp import OCP
 from nocl.solvers.ddp.batch import Job, Piece, Rows, assembled, pieces
 from nocl.solvers.ddp.kernel import ddp_source, pack_weights
 from nocl.solvers.ddp.without_compiler import ddp_kernel
-from nocl.solvers.grid import ROWS, measured, stiff
+from nocl.solvers.grid import ROWS, fastest_at_start, measured
 from nocl.substeps import COARSE, Grid, settled
 from nocl.support import checks
 from nocl.support.checks import Array
@@ -231,7 +231,8 @@ def substeps_for(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int, tol
         ddp.checked = True
         return measured(ocp, functions, ddp.solve(x0, progress=False), substeps)
 
-    return settled(f"DDP of {ocp.system.name}", ask, lambda: stiff(ocp, functions, ocp.horizon / intervals), tolerance)
+    return settled(f"DDP of {ocp.system.name}", ask, ocp.horizon / intervals, lambda: fastest_at_start(ocp, functions),
+                   tolerance)
 
 
 def _functions(ocp: OCP, dynamics: LearnedDynamics | None) -> Functions:

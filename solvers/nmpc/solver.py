@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from nocl.data import Solution, Trajectory
 from nocl.judge import check_made_for, dynamics_function
 from nocl.ocp import OCP
-from nocl.solvers.grid import measured, stiff
+from nocl.solvers.grid import fastest_at_start, measured
 from nocl.solvers.lqr import LQR
 from nocl.solvers.mirrors import Mirror, mirrors
 from nocl.solvers.nmpc import guesses as starting
@@ -210,7 +210,7 @@ class NMPC:
             return measured(self.ocp, self._with(substeps)._program.functions, s, substeps)
 
         functions, step = self._with(1)._program.functions, float(np.diff(call.t).max())
-        substeps = settled(f"NMPC of {self.ocp.system.name}", ask, lambda: stiff(self.ocp, functions, step))
+        substeps = settled(f"NMPC of {self.ocp.system.name}", ask, step, lambda: fastest_at_start(self.ocp, functions))
         if any(s.success.any() for s in found.values()):
             known["substeps"] = substeps
         return found[substeps]
@@ -276,9 +276,9 @@ class NMPC:
                            version("casadi"), version("nocl"))
 
 
-def closed_loop(ocp: OCP, intervals: int, seed: int) -> Loop:
+def closed_loop(ocp: OCP, intervals: int, seed: int, substeps: int | None = None) -> Loop:
     """NMPC as feedback, as the command line makes it."""
-    return NMPC(ocp, intervals, seed=seed).controller()
+    return NMPC(ocp, intervals, seed=seed, substeps=substeps).controller()
 
 
 @dataclass(frozen=True)
