@@ -241,12 +241,17 @@ def planned(ocp: OCP, name: str, method: Any, parts: Sequence[Solution | str], B
         u[rows], predicted[rows], plan.x[rows] = s.u, s.cost, s.x
         plan.costate[rows] = s.costate
         ms[rows] = 1e3 * s.seconds
-        evaluations[rows] = s.iterations * K * STAGES * getattr(method, "substeps", 1)
+        evaluations[rows] = s.iterations * K * STAGES * substeps_of(method)
         solves[rows] = np.maximum(s.starts, 1)
         message += _unsolved(ocp, s)
     u[[bool(m) for m in message]] = np.nan
     solved = Solved(ms, solves, predicted, evaluations, plan, message)
     return MethodRun(name, f"open loop, held on {count(K, 'interval')}", method, u, solved=solved)
+
+
+def substeps_of(solver: Any) -> int:
+    """Runge-Kutta steps in each of its intervals."""
+    return int(getattr(getattr(solver, "settled", solver), "substeps", 1))
 
 
 def _unsolved(ocp: OCP, solution: Solution) -> list[str]:

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nocl.ocp import OCP
-from nocl.scales import steps, usual_sizes
+from nocl.scales import units
 from nocl.smoothness import kinks
 from nocl.support import checks, interrupt
 from nocl.support.checks import Array
@@ -264,8 +264,8 @@ class _Judge:
     @cached_property
     def unit(self) -> Array:
         """What 1 stands for in each of z, for CVODES' absolute tolerance; 1 in ordinary problems."""
-        sizes = usual_sizes(self.ocp)
-        return np.r_[steps(sizes.x), steps(sizes.cost)]
+        of = units(self.ocp)
+        return np.r_[of.x, of.cost]
 
     def sized(self, z: Any) -> Any:
         return z if (self.unit == 1).all() else z * self.unit
@@ -276,7 +276,7 @@ class _Judge:
     def integrate(self, solver: ca.Function, z: Array, p: Any) -> tuple[Array | None, float]:
         """(states at the solver's times, last quadrature), or None where CVODES fails or yields NaN."""
         try:
-            with interrupt.deferred():
+            with interrupt.kept():
                 result = solver(x0=z / self.unit, p=p)
         except RuntimeError:
             return None, np.nan

@@ -36,6 +36,12 @@ def usual_sizes(ocp: OCP) -> Sizes:
     return Sizes((s.ubx - s.lbx) / 2, (s.ubu - s.lbu) / 2, float(np.median(J)) if J.size else 1.0)
 
 
+def units(ocp: OCP) -> Sizes:
+    """What solvers take for 1 of each state and control, and of the cost: a usual size, as a power of STEP."""
+    usual = usual_sizes(ocp)
+    return Sizes(steps(usual.x), steps(usual.u), float(steps(usual.cost)))
+
+
 def steps(size: Array | float) -> Array:
     """The power of STEP that is nearest to each size > 0."""
     return np.asarray(STEP ** np.round(np.log(size) / np.log(STEP)))

@@ -138,6 +138,16 @@ def test_a_state_whose_solver_is_stuck_gets_ipopts_answer(stuck_from):
     assert "by IPOPT after fatrop: fatrop was given up: it did not come back within 0.5 s" in solution.message[1]
 
 
+def test_an_error_of_the_library_fails_one_start_and_not_the_batch():
+    ocp = pendulum.ocp()
+    x0 = np.array([[3.0, 0.0], [0.0, 0.0]])
+    given = {"starts": 2, "passes": 0, "options": {"error_on_fail": True, "ipopt.max_iter": 12}}
+    solution = NMPC(ocp, 20, solver="ipopt", **given).solve(x0, workers=1)
+    assert solution.success.tolist() == [False, True]
+    assert "ipopt ended with an error: " in solution.message[0]
+    assert "another solver" in solution.message[0]
+
+
 def test_a_state_whose_solvers_are_stuck_fails_and_the_others_go_on(stuck_from):
     ocp = pendulum.ocp()
     x0 = np.array([[3.0, 0.0], [3.2, 0.1], [3.1, 0.0]])

@@ -17,6 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from nocl.exports import l4casadi_forms
+from nocl.exports.onnx_operations.arithmetic import sigmoid
 from nocl.nets import MLP, FeatureNet, Sine
 
 BACKENDS = ("native", "l4casadi")
@@ -213,10 +214,6 @@ def _gelu(layer: nn.GELU, x: ca.MX, place: str) -> ca.MX:
 
 def _elu(layer: nn.ELU, x: ca.MX, place: str) -> ca.MX:
     return ca.if_else(x > 0, x, layer.alpha * ca.expm1(ca.if_else(x > 0, 0, x)))
-
-
-def sigmoid(x: ca.MX) -> ca.MX:
-    return 0.5 * (1 + ca.tanh(x / 2))  # exp(-x) overflows in the derivative
 
 
 RULES: dict[type[nn.Module], Rule] = {

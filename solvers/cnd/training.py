@@ -52,8 +52,8 @@ from nocl.solvers.cnd.validate import (
 from nocl.solvers.cnd.value import ValueLabels, on_fine_grid, value_loss, value_net, value_tails
 from nocl.solvers.ddp.bank import SolutionBank, extend
 from nocl.solvers.ddp.global_search import solve_globally
-from nocl.solvers.ddp.solver import DDP
-from nocl.solvers.grid import FINE, TRIED, measured
+from nocl.solvers.ddp.solver import DDP, substeps_for
+from nocl.substeps import FINE
 from nocl.support import store
 from nocl.support.checks import Array
 from nocl.support.threads import one_thread
@@ -68,7 +68,6 @@ CHECKPOINT = "training.safetensors"
 VALUE_LARGE = 0.05  # mean |V - J*| / J* that a warning is given above
 VALUE_HELD_OUT = 16  # times held_out: a mean of relative errors hangs on the few states that are hard
 LOSSES = 40  # of each regression that the card keeps
-PROBES = 8  # initial states that substeps are chosen on
 
 
 def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "default",
@@ -124,23 +123,6 @@ def _expect(settings: Any, kind: Any) -> Any:
     return settings or kind()
 
 
-def substeps_for(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int) -> int:
-    """As many as a few initial states' solutions ask for; more are tried where nothing is solved with few."""
-    functions = ocp.functions if dynamics is None else ocp.functions.on(dynamics.to_casadi())
-    substeps, grid = 1, None
-    while substeps <= TRIED[-1]:
-        ddp = DDP(ocp, intervals=intervals, substeps=substeps, dynamics=dynamics, constraints="soft")
-        ddp.checked = True
-        grid = measured(ocp, functions, ddp.solve(ocp.initial_states.sample(PROBES, own_numbers(0))), substeps)
-        if grid is not None and grid.error <= FINE:
-            return substeps
-        if grid is not None and grid.needed is None:
-            warnings.warn(f"{ocp.system.name}: {grid}", stacklevel=5)
-            return TRIED[-1]
-        substeps = 4 * substeps if grid is None or grid.needed is None else grid.needed
-    return 1  # nothing can be solved: what follows says so
-
-
 class Training:
     """One run of the default method; its state between rounds is what a checkpoint holds."""
 
@@ -149,7 +131,7 @@ class Training:
         self.ocp, self.settings, self.seed = ocp, settings, seed
         self.learned = dynamics is not None
         self.f = to_torch(ocp.functions.f) if dynamics is None else dynamics
-        self.substeps = settings.substeps or substeps_for(ocp, dynamics, settings.intervals)
+        self.substeps = settings.substeps or substeps_for(ocp, dynamics, settings.intervals, FINE)
         soft = {"dynamics": dynamics, "constraints": "soft"}
         self.ddp = DDP(ocp, intervals=settings.intervals, substeps=self.substeps, **soft)
         self.fine = DDP(ocp, intervals=4 * settings.intervals, substeps=-(-self.substeps // 4), **soft)

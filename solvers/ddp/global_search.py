@@ -94,15 +94,19 @@ class GlobalDDP:
     starts: int = 16
     seed: int = 0
 
+    @property
+    def substeps(self) -> int:
+        return self.ddp.substeps
+
     def solve(self, x0: ArrayLike, workers: int | str = "auto", out: str | os.PathLike[str] | None = None,
               progress: bool | None = None) -> Solution:
         return solve_globally(self.ddp, x0, starts=self.starts, seed=self.seed, workers=workers, out=out,
                               progress=progress)
 
 
-def global_ddp(ocp: OCP, intervals: int, seed: int) -> GlobalDDP:
+def global_ddp(ocp: OCP, intervals: int, seed: int, substeps: int | None = None) -> GlobalDDP:
     """DDP from everywhere, as the command line makes it."""
-    return GlobalDDP(DDP(ocp, intervals=intervals), seed=seed)
+    return GlobalDDP(DDP(ocp, intervals=intervals, substeps=substeps), seed=seed)
 
 
 class _Kept(Search):

@@ -17,7 +17,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,11 +26,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nocl.data import Solution
+from nocl.functions import Functions
 from nocl.ocp import OCP
+from nocl.sampling import own_numbers
 from nocl.solvers.ddp.batch import Job, Piece, Rows, assembled, pieces
 from nocl.solvers.ddp.kernel import ddp_source, pack_weights
 from nocl.solvers.ddp.without_compiler import ddp_kernel
-from nocl.solvers.grid import measured
+from nocl.solvers.grid import ROWS, fastest_at_start, measured
+from nocl.substeps import COARSE, Grid, settled
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.support.fields import Checked, count, positive
@@ -70,8 +73,9 @@ class DDP:
     ocp : OCP
     intervals : int
         K, the number of held controls on [t0, T].
-    substeps : int
-        RK4 steps in each interval; more for fast dynamics.
+    substeps : int, optional
+        RK4 steps in each interval. Default: 1, or where a few solutions from the OCP's initial states show that this is
+        too coarse for the plant, as many as they ask for (nocl/substeps.py); a warning says so.
     dynamics : LearnedDynamics, optional
         f_theta in place of the exact f; its networks' derivatives are generated C too.
     constraints : "hard" or "soft"
@@ -83,24 +87,25 @@ class DDP:
         Default: the folder that NOCL_CACHE names, or else one that goes with the process.
     """
 
-    def __init__(self, ocp: OCP, *, intervals: int = 80, substeps: int = 1, dynamics: LearnedDynamics | None = None,
-                 settings: DDPSettings | None = None, constraints: str = "hard", threads: int | None = None,
+    def __init__(self, ocp: OCP, *, intervals: int = 80, substeps: int | None = None,
+                 dynamics: LearnedDynamics | None = None, settings: DDPSettings | None = None,
+                 constraints: str = "hard", threads: int | None = None,
                  cache: str | os.PathLike[str] | None = None) -> None:
         checks.problem(ocp, "DDP")
-        for name, value in (("intervals", intervals), ("substeps", substeps),
+        for name, value in (("intervals", intervals), ("substeps", 1 if substeps is None else substeps),
                             ("threads", 1 if threads is None else threads)):
             if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
                 raise ValueError(f"DDP: {name} is {value!r}; expected an integer >= 1")
         if constraints not in ("hard", "soft"):
             raise ValueError(f"DDP: constraints is {constraints!r}; expected 'hard' or 'soft'")
         self.ocp, self.intervals, self.settings = ocp, int(intervals), settings or DDPSettings()
-        self.constraints, self.substeps = constraints, int(substeps)
+        self.constraints, self.dynamics, self.cache = constraints, dynamics, cache
         self.checked = False  # whether the grid was held against the plant
         self.threads = int(threads or os.cpu_count() or 1)
-        self.dynamics, self.cache = dynamics, cache
         self.evaluations: Counter[str] = Counter()  # of f in this process, one for each state: "rollout", "backward"
         net = None if dynamics is None else _fitting(ocp, dynamics)
         self._weights = np.zeros(1) if net is None else pack_weights(net)
+        self.substeps = int(substeps or substeps_for(ocp, dynamics, self.intervals))
         self.kernel = ddp_kernel(ocp, dynamics, cache, self.substeps)
         self._lb, self._ub = np.ascontiguousarray(ocp.system.lbu), np.ascontiguousarray(ocp.system.ubu)
 
@@ -147,8 +152,7 @@ class DDP:
         if self.checked or not solution.success.any():
             return
         self.checked = True
-        f = None if self.dynamics is None else self.dynamics.to_casadi()
-        grid = measured(self.ocp, self.ocp.functions.on(f) if f else self.ocp.functions, solution, self.substeps)
+        grid = measured(self.ocp, _functions(self.ocp, self.dynamics), solution, self.substeps)
         if grid is not None and grid.coarse:
             warnings.warn(f"DDP of {self.ocp.system.name}: {grid}", stacklevel=3)
 
@@ -216,6 +220,24 @@ class DDP:
         if bad.size:
             raise ValueError(f"t0[{bad[0]}] is {times[bad[0]]}; expected 0 <= t0 < horizon = {self.ocp.horizon}")
         return times
+
+
+@lru_cache(maxsize=32)
+def substeps_for(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int, tolerance: float = COARSE) -> int:
+    """As many as solutions from a few initial states ask for, so that they are off by `tolerance` at most."""
+    functions, x0 = _functions(ocp, dynamics), ocp.initial_states.sample(ROWS, own_numbers(0))
+
+    def ask(substeps: int) -> Grid | None:
+        ddp = DDP(ocp, intervals=intervals, substeps=substeps, dynamics=dynamics, constraints="soft")
+        ddp.checked = True
+        return measured(ocp, functions, ddp.solve(x0, progress=False), substeps)
+
+    return settled(f"DDP of {ocp.system.name}", ask, ocp.horizon / intervals, lambda: fastest_at_start(ocp, functions),
+                   tolerance)
+
+
+def _functions(ocp: OCP, dynamics: LearnedDynamics | None) -> Functions:
+    return ocp.functions if dynamics is None else ocp.functions.on(dynamics.to_casadi())
 
 
 @dataclass

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from nocl.data import Solution, Trajectory
 from nocl.judge import check_made_for, dynamics_function
 from nocl.ocp import OCP
-from nocl.solvers.grid import measured
+from nocl.solvers.grid import fastest_at_start, measured
 from nocl.solvers.lqr import LQR
 from nocl.solvers.mirrors import Mirror, mirrors
 from nocl.solvers.nmpc import guesses as starting
@@ -29,6 +29,7 @@ from nocl.solvers.nmpc.sensitivity import cost_to_go, dense, second_variation
 from nocl.solvers.nmpc.tasks import Outcome, Task, attempt, failure, outside, solved_by, violated_start
 from nocl.solvers.nmpc.transcription import BACKENDS, Answer, Transcription
 from nocl.solvers.search import Found, Moves, Rows, Search
+from nocl.substeps import Grid, settled
 from nocl.support import checks, compiler
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
@@ -47,7 +48,8 @@ class NMPC:
     intervals : N
     dynamics : casadi.Function (x, u) -> xdot, or an object with `to_casadi()`; default: the exact f
     solver : "fatrop" (fast) or "ipopt" (reference); another nlpsol of CasADi's by its name
-    substeps : RK4 steps in each interval
+    substeps : RK4 steps in each interval; default: 1, or where the first solutions show that this is too coarse for the
+        plant, as many as they ask for (nocl/substeps.py); a warning says so
     horizon : length of the window that is optimised, at most the OCP's horizon T (default); it ends at T at the latest
     terminal : cost at the window's end in place of G: a casadi.Function (x) or (x, t) -> number, or an object with
         `value_to_casadi()`, such as a trained value function
@@ -70,7 +72,7 @@ class NMPC:
     intervals: int = 80
     dynamics: Any = field(default=None, kw_only=True)
     solver: str = field(default="fatrop", kw_only=True)
-    substeps: int = field(default=1, kw_only=True)
+    substeps: int | None = field(default=None, kw_only=True)
     horizon: float | None = field(default=None, kw_only=True)
     terminal: Any = field(default=None, kw_only=True)
     starts: int = field(default=8, kw_only=True)
@@ -86,6 +88,8 @@ class NMPC:
         checks.problem(self.ocp, "NMPC")
         for name, least in (("intervals", 2), ("substeps", 1), ("starts", 1), ("passes", 0), ("neighbours", 1)):
             value = getattr(self, name)
+            if name == "substeps" and value is None:
+                continue
             if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
                 raise ValueError(f"NMPC: {name} is {value!r}; expected an integer >= {least}")
         if self.constraints not in ("hard", "soft"):
@@ -116,12 +120,30 @@ class NMPC:
         """A fingerprint of the program: of the problem, models and settings that it is built from."""
         options = sorted((self.options or {}).items())
         return fingerprint(self.ocp.to_data(), self.dynamics, self.terminal,
-                           int(self.intervals), int(self.substeps), self.constraints, self.solver, options)
+                           int(self.intervals), int(self.substeps or 0), self.constraints, self.solver, options)
 
-    @cached_property
+    @property
     def program(self) -> Transcription:
         """The nonlinear program, built once for each problem and settings."""
+        return self.settled._program
+
+    @cached_property
+    def _program(self) -> Transcription:
         return shared_program(_Recipe(f"{self.key}{self._folder or ''}", self))
+
+    @property
+    def settled(self) -> NMPC:
+        """This one, its substeps a number: those that its solutions so far have asked for, 1 before there are any."""
+        return self if self.substeps is not None else self._with(self._with(1)._program.settled.get("substeps", 1))
+
+    def _with(self, substeps: int) -> NMPC:
+        if substeps not in self._others:
+            self._others[substeps] = replace(self, substeps=substeps)
+        return self._others[substeps]
+
+    @cached_property
+    def _others(self) -> dict[int, NMPC]:
+        return {}
 
     @property
     def _folder(self) -> Path | None:
@@ -169,26 +191,50 @@ class NMPC:
         if n < 1 and not given:
             raise ValueError(f"starts is {n}; expected at least 1, or guesses")
         show = sys.stderr.isatty() if progress is None else progress
-        journal = Journal(None if out is None else Path(out), self._run_key(rows, t, given, n, warm) if out else "")
-        states = _States(self, rows, t, given, warm, Pool(workers), journal, show)
-        rounds = self.passes if n else 0
-        search = Search(states, self.ocp, self.mirrors if rounds else [], rows, t, neighbours=self.neighbours,
-                        rounds=rounds, seed=self.seed)
-        search.stage("NMPC", search.cold, np.arange(len(rows)), 0, n)
-        search.improve(n)
-        solution = states.finished(search.solution())
-        self._check_grid(solution)
+        call = _Call(rows, t, given, warm, n, Pool(workers), None if out is None else Path(out), show)
+        solution = self._settle(call) if self.substeps is None else self._told(self._search(call))
         return self.with_gains(solution) if gains else solution
 
-    def _check_grid(self, solution: Solution) -> None:
-        """Warns, once for each program, where the first solutions show a grid that is too coarse."""
+    def _settle(self, call: _Call) -> Solution:
+        """Solved with as few substeps as the first solutions are right with, which is remembered.
+
+        In a folder all that is asked there begins with 1, so that the same call finds what it left.
+        """
+        known = self._with(1)._program.settled
+        if "substeps" in known and call.out is None:
+            return self.settled._search(call)
+        found = dict[int, Solution]()
+
+        def ask(substeps: int) -> Grid | None:
+            s = found[substeps] = self._with(substeps)._search(call.within(substeps))
+            return measured(self.ocp, self._with(substeps)._program.functions, s, substeps)
+
+        functions, step = self._with(1)._program.functions, float(np.diff(call.t).max())
+        substeps = settled(f"NMPC of {self.ocp.system.name}", ask, step, lambda: fastest_at_start(self.ocp, functions))
+        if any(s.success.any() for s in found.values()):
+            known["substeps"] = substeps
+        return found[substeps]
+
+    def _told(self, solution: Solution) -> Solution:
+        """The same; a warning, once for each program, where the first solutions show a grid that is too coarse."""
         p = self.program
-        if p.checked or self.terminal is not None or not solution.success.any():
-            return
-        p.checked.append(True)
-        grid = measured(self.ocp, p.functions, solution, self.substeps)
-        if grid is not None and grid.coarse:
-            warnings.warn(f"NMPC of {self.ocp.system.name}: {grid}", stacklevel=3)
+        if "substeps" not in p.settled and solution.success.any():
+            p.settled["substeps"] = p.substeps
+            grid = measured(self.ocp, p.functions, solution, p.substeps)
+            if grid is not None and grid.coarse:
+                warnings.warn(f"NMPC of {self.ocp.system.name}: {grid}", stacklevel=3)
+        return solution
+
+    def _search(self, call: _Call) -> Solution:
+        """Solved with this number of substeps."""
+        key = self._run_key(call.x0, call.t, call.given, call.starts, call.warm) if call.out else ""
+        states = _States(self, call, Journal(call.out, key))
+        rounds = self.passes if call.starts else 0
+        search = Search(states, self.ocp, self.mirrors if rounds else [], call.x0, call.t, neighbours=self.neighbours,
+                        rounds=rounds, seed=self.seed)
+        search.stage("NMPC", search.cold, np.arange(len(call.x0)), 0, call.starts)
+        search.improve(call.starts)
+        return states.finished(search.solution())
 
     def with_gains(self, solution: Solution) -> Solution:
         """A Solution of this NMPC with its feedback `gain` and `V_xx`.
@@ -230,9 +276,9 @@ class NMPC:
                            version("casadi"), version("nocl"))
 
 
-def closed_loop(ocp: OCP, intervals: int, seed: int) -> Loop:
+def closed_loop(ocp: OCP, intervals: int, seed: int, substeps: int | None = None) -> Loop:
     """NMPC as feedback, as the command line makes it."""
-    return NMPC(ocp, intervals, seed=seed).controller()
+    return NMPC(ocp, intervals, seed=seed, substeps=substeps).controller()
 
 
 @dataclass(frozen=True)
@@ -246,7 +292,7 @@ class _Recipe:
 @lru_cache(maxsize=KEPT)
 def shared_program(recipe: _Recipe) -> Transcription:
     m = recipe.nmpc
-    return Transcription(m.ocp, dynamics_function(m.ocp, m.dynamics), int(m.intervals), int(m.substeps),
+    return Transcription(m.ocp, dynamics_function(m.ocp, m.dynamics), int(m.intervals), int(m.substeps or 1),
                          m.constraints == "soft", m.solver, tuple(sorted((m.options or {}).items())), m.terminal,
                          None if m._folder is None else (m.key, m._folder))
 
@@ -272,6 +318,24 @@ def _terminal(ocp: OCP, terminal: Any) -> ca.Function | None:
     return g
 
 
+@dataclass(frozen=True, eq=False)
+class _Call:
+    """One call of solve, checked."""
+
+    x0: Array  # [B, nx]
+    t: Array  # [N+1]
+    given: list[list[Guess]]
+    warm: int  # how many of these, the first ones, are solutions
+    starts: int
+    pool: Pool
+    out: Path | None
+    show: bool
+
+    def within(self, substeps: int) -> _Call:
+        """The same, what it keeps in a folder of its own for more substeps than 1."""
+        return self if substeps == 1 or self.out is None else replace(self, out=self.out / f"substeps-{substeps}")
+
+
 @dataclass(frozen=True)
 class _Job:
     """What a worker does with a task."""
@@ -292,12 +356,10 @@ class _Job:
 class _States:
     """The states of one call of solve, as a search asks for them: a task for each state and stage."""
 
-    def __init__(self, nmpc: NMPC, x0: Array, t: Array, given: list[list[Guess]], warm: int, pool: Pool,
-                 journal: Journal, show: bool) -> None:
-        self.nmpc, self.x0, self.t, self.given, self.warm = nmpc, x0, t, given, warm
-        self.pool, self.journal, self.show = pool, journal, show
-        self.refusal = [violated_start(nmpc.program, x) for x in x0]
-        self.failed: list[Answer | None] = [None] * len(x0)  # of each state's solves that failed, by rank
+    def __init__(self, nmpc: NMPC, call: _Call, journal: Journal) -> None:
+        self.nmpc, self.call, self.journal, self.x0, self.t = nmpc, call, journal, call.x0, call.t
+        self.refusal = [violated_start(nmpc.program, x) for x in self.x0]
+        self.failed: list[Answer | None] = [None] * len(self.x0)  # of each state's solves that failed, by rank
 
     def begin(self, stage: int, what: str) -> None:
         self.number, self.what = stage - 1, what
@@ -305,8 +367,9 @@ class _States:
     def cold(self, rows: Rows, first: int, count: int) -> Found:
         """The first time also the guesses that solve was given."""
         name, begun = (f"fresh-{self.number}", True) if self.number else ("start", False)
-        tasks = [Task(f"{name}-{i:06d}", i, self.x0[i], self.t, () if begun else [guess[i] for guess in self.given],
-                      0 if begun else self.warm, first, count, self.nmpc.seed, self.nmpc.time_limit) for i in rows]
+        given, warm = ([], 0) if begun else (self.call.given, self.call.warm)
+        tasks = [Task(f"{name}-{i:06d}", i, self.x0[i], self.t, [guess[i] for guess in given], warm, first, count,
+                      self.nmpc.seed, self.nmpc.time_limit) for i in rows]
         return self._do(tasks)
 
     def follow(self, moves: Moves, guess: Callable[[Moves], dict[str, Array]]) -> Found:
@@ -320,7 +383,7 @@ class _States:
 
     def _do(self, tasks: Sequence[Task]) -> Found:
         tasks = [task for task in tasks if not self.refusal[task.row]]
-        outcomes = do(_Job(self.nmpc), tasks, self.pool, self.journal, self.show, self.what)
+        outcomes = do(_Job(self.nmpc), tasks, self.call.pool, self.journal, self.call.show, self.what)
         for outcome in outcomes:
             best, failed = self.failed[outcome.row], outcome.failed
             if failed is not None and (best is None or failed.rank < best.rank):

@@ -20,7 +20,7 @@ import numpy as np
 
 from nocl.functions import Functions
 from nocl.ocp import OCP
-from nocl.scales import steps, usual_sizes
+from nocl.scales import steps, units
 from nocl.support import compiler
 from nocl.support.checks import Array
 from nocl.support.guard import Guarded, NoAnswerError
@@ -151,11 +151,11 @@ class Transcription:
     @cached_property
     def scales(self) -> Scales:
         """The sizes that the solver sees as 1, in steps of about a thousand: most problems are solved as they stand."""
-        N, usual = self.N, usual_sizes(self.ocp)
-        x, u, cost = (steps(size) for size in (usual.x, usual.u, usual.cost))
+        N, of = self.N, units(self.ocp)
+        x, u = of.x, of.u
         h = steps(self.ocp.constraint_scales) if self.n_path else np.zeros(0)
         w = np.r_[np.tile(np.r_[x, u], N), x]
-        return Scales(w, np.r_[x, x, np.tile(np.r_[h, x], N - 1), h], float(cost), x)
+        return Scales(w, np.r_[x, x, np.tile(np.r_[h, x], N - 1), h], of.cost, x)
 
     def split(self, w: Any) -> tuple[Any, Any]:
         """(X [nx, N+1], U [nu, N]) of the interleaved variables."""
@@ -229,8 +229,7 @@ class Transcription:
         try:
             answer: Answer = self._guarded(self.patience if time_limit is None else time_limit, x0, t, x, u)
         except NoAnswerError as error:
-            return Answer(x, u, np.full_like(x, np.nan), np.inf, False, f"{self.backend} was given up: {error}", np.inf,
-                          0, GIVEN_UP)
+            return self._no_answer(x, u, f"was given up: {error}")
         self._took[0] = max(self._took[0], time.perf_counter() - begin)
         return answer
 
@@ -246,9 +245,9 @@ class Transcription:
         return [0.0]  # seconds of the slowest solve that came back
 
     @cached_property
-    def checked(self) -> list[bool]:
-        """Not empty once its grid was held against the plant."""
-        return []
+    def settled(self) -> dict[str, int]:
+        """`substeps` that its first solutions have asked for, once they were held against the plant."""
+        return {}
 
     @cached_property
     def _guarded(self) -> Guarded:
@@ -268,11 +267,18 @@ class Transcription:
             took.append(time.perf_counter() - begin)
         return min(took)
 
+    def _no_answer(self, x: Array, u: Array, why: str) -> Answer:
+        """A failure of the solver itself, which leaves the guess."""
+        return Answer(x, u, np.full_like(x, np.nan), np.inf, False, f"{self.backend} {why}", np.inf, 0, GIVEN_UP)
+
     def _solve(self, x0: Array, t: Array, x: Array, u: Array) -> Answer:
         w0 = np.r_[np.c_[x[:-1], u].ravel(), x[-1]]
         solver, p = self.solver, np.r_[x0, np.diff(t), t[-1]]
         scales = self.scales
-        result = solver(x0=w0 / scales.w, p=p, **self._limits)
+        try:
+            result = solver(x0=w0 / scales.w, p=p, **self._limits)
+        except RuntimeError as error:  # of the library: it fails one start, not the batch
+            return self._no_answer(x, u, f"ended with an error: {str(error).strip().splitlines()[-1]}")
         stats = solver.stats()
         X, U = (v.full().T for v in self.split(result["x"] * scales.w))
         U = np.clip(U, self.ocp.system.lbu, self.ocp.system.ubu)  # IPOPT relaxes bounds by 1e-8
