@@ -19,7 +19,7 @@ from nocl.exports.casadi_forms import to_casadi
 from nocl.exports.onnx_reader import from_onnx
 from nocl.exports.onnx_writer import Session, to_onnx
 from nocl.exports.parity import Certificate, ExportPart, Finding
-from nocl.support import compiler, store
+from nocl.support import checks, compiler, store
 from nocl.support.checks import Array
 from nocl.system import System
 
@@ -64,10 +64,10 @@ def export(thing: Any, folder: str | os.PathLike[str], to: Sequence[str] = ("cas
     Returns the Certificate; str() of it is one line. All or nothing: where a limit is passed (float64 1e-12, float32
     1e-5, see nocl.exports.parity) it raises ValueError, and the folder is as it was.
     """
-    folder = Path(os.path.abspath(folder))
-    for form in (*to, *(against or ())):
-        if form not in FORMS:
-            raise ValueError(f"export: the form is {form!r}; expected some of {', '.join(FORMS)}")
+    folder = Path(os.path.abspath(checks.folder(folder, "folder", "export")))
+    for form in (*checks.words(to, "to", "export"), *(() if against is None else checks.words(against, "against",
+                                                                                               "export"))):
+        checks.word(form, FORMS, "the form", "export")
     missing = missing_backends()
     for form in to:
         if form in missing:

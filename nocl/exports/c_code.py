@@ -90,8 +90,7 @@ def to_c(function: ca.Function, folder: str | Path, name: str | None = None, *, 
     """
     name = name or function.name()
     inputs, outputs = _arguments(function, name, bounds, labels or {})
-    if dtype not in REAL:
-        raise ValueError(f"to_c: dtype is {dtype!r}; expected one of {', '.join(REAL)}")
+    checks.word(dtype, tuple(REAL), "dtype", "to_c")
     code, sizes = _generate(function, f"{name}_casadi", REAL[dtype])
     z = _samples([a.box for a in inputs if a.box], samples, seed)
     values = np.hstack([v.full().T for v in _inner(function, name).map(len(z)).call(_split(z, inputs))])
@@ -452,7 +451,8 @@ def _put(folder: Path, files: Mapping[str, str]) -> Path:
         folder.parent.mkdir(parents=True, exist_ok=True)
         part = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
     except OSError as error:
-        raise ValueError(f"to_c: {folder} cannot be made ({error.strerror}): name another folder") from error
+        raise ValueError(f"to_c: {folder} cannot be made ({error.strerror}); expected a folder that can be written: "
+                         "name another folder") from error
     try:
         for file, text in files.items():
             (part / file).write_text(text, encoding="utf-8")

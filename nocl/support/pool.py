@@ -22,6 +22,7 @@ import numpy as np
 from tqdm import tqdm
 
 from nocl.support.atomic import write_bytes
+from nocl.support.checks import LARGEST, shown
 from nocl.support.lock import alone
 
 Task = Any
@@ -50,9 +51,9 @@ class Pool:
 
     def __post_init__(self) -> None:
         w = self.workers
-        count = isinstance(w, (int, np.integer)) and not isinstance(w, bool) and w >= 1
+        count = isinstance(w, (int, np.integer)) and not isinstance(w, bool) and 1 <= w <= LARGEST
         if not count and not (isinstance(w, str) and (w == "auto" or "://" in w)):
-            raise ValueError(f"workers is {w!r}; expected a number >= 1, 'auto', or a Dask scheduler's 'tcp://...'")
+            raise ValueError(f"workers is {shown(w)}; expected a number >= 1, 'auto', or a Dask scheduler's 'tcp://...'")
 
     def outcomes(self, job: Any, tasks: Sequence[Task]) -> Iterator[Outcome]:
         """Each task's outcome once, in any order; `job(task)` does one, and pickles."""

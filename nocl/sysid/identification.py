@@ -206,7 +206,7 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
     UserWarning
         Where the labels speak against what is stated.
     """
-    settings = _check_arguments(system, method, settings, seed, data)
+    settings = _check_arguments(system, method, gradients, settings, seed, data)
     stated, start, bar = Stated.of(system, known, control_affine), time.perf_counter(), Progress(system.name, progress)
     if isinstance(data, Log):
         assert isinstance(settings, LogSettings)
@@ -283,15 +283,15 @@ def _check_stated(stated: Stated, method: str) -> None:
                          "the default method")
 
 
-def _check_arguments(system: System, method: str, settings: Settings | PaperSettings | LogSettings | None, seed: int,
+def _check_arguments(system: System, method: str, gradients: bool,
+                     settings: Settings | PaperSettings | LogSettings | None, seed: int,
                      data: Dataset | Log | None) -> Settings | PaperSettings | LogSettings:
-    if not isinstance(system, System):
-        raise ValueError(f"identify: system is a {type(system).__name__}; expected a nocl.System: "
-                         "of an OCP, pass ocp.system")
-    if method not in RECIPES:
-        raise ValueError(f"identify: method is {method!r}; expected one of {', '.join(RECIPES)}")
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ValueError(f"identify: seed is {seed!r}; expected an integer >= 0")
+    checks.instance(System, system, "system", "identify", "of an OCP, pass ocp.system")
+    checks.word(method, RECIPES, "method", "identify")
+    checks.whole(seed, "seed", "identify", most=2**62)
+    checks.flag(gradients, "gradients", "identify")
+    if data is not None and not isinstance(data, (Dataset, Log)):
+        raise ValueError(f"identify: data is a {type(data).__name__}; expected a nocl.Dataset or a nocl.Log")
     if isinstance(data, Log) and method != "default":
         raise ValueError(f"identify: method is {method!r}; logs take 'default' only: leave it out")
     expected = LogSettings if isinstance(data, Log) else PaperSettings if method == "paper" else Settings
