@@ -207,7 +207,7 @@ class Solution:
         if len(x) != len(self):
             raise ValueError(f"x has {len(x)} rows; expected {len(self)}, one for each row of the Solution")
         if np.isnan(self.gain).all():
-            raise ValueError("this Solution has no `gain`, expected one: take that of NMPC.solve(x0, gains=True), or "
+            raise ValueError("this Solution has no `gain`: take that of NMPC.solve(x0, gains=True), or "
                              "DDP's")
         b, k = np.arange(len(self)), self._interval(np.array([t]))[:, 0]
         return self.u[b, k] + np.einsum("bij,bj->bi", self.gain[b, k], x - self.x[b, k])

@@ -153,7 +153,7 @@ def _with_sizes(g: ca.Function, sizes: tuple[int, int], n_out: int, what: str, f
 def _check_options(ocp: OCP, hold: int | None, nodes: int, t0: float) -> float:
     """t0, a float; ValueError where one of them is wrong."""
     if hold is not None:
-        checks.whole(hold, "hold (None: continuous feedback)", "simulate", 1)
+        checks.whole(hold, "hold", "simulate (None: continuous feedback)", 1)
     checks.whole(nodes, "nodes", "simulate", 2)
     return checks.start_time(t0, ocp.horizon)
 
@@ -172,12 +172,14 @@ def _jumps(ocp: OCP, kicks: Kicks | None, B: int, t0: float) -> list[tuple[float
         raise ValueError(f"simulate: kicks is {checks.shown(kicks)}; expected a list of pairs (time, dx [nx] or "
                          "[B, nx])")
     for when, dx in kicks or ():
-        time = checks.between(when, t0, ocp.horizon, "the time of a kick", "simulate")
+        time = checks.between(when, -np.inf, np.inf, "the time of a kick", "simulate")
         what, expected = f"the kick at t = {time:g}", f"finite ({ocp.system.nx},) or ({B}, {ocp.system.nx})"
         d = checks.numeric(dx, what, "simulate", expected)
         if d.shape not in ((ocp.system.nx,), (B, ocp.system.nx)) or not np.isfinite(d).all():
             raise ValueError(f"{what} has shape {d.shape}; expected {expected}")
-        jumps.append((float(time), np.broadcast_to(d, (B, ocp.system.nx))))
+        if not t0 <= time <= ocp.horizon:
+            raise ValueError(f"a kick at t = {time:g}; expected a time in [{t0:g}, {ocp.horizon:g}]")
+        jumps.append((time, np.broadcast_to(d, (B, ocp.system.nx))))
     return sorted(jumps, key=lambda jump: jump[0])
 
 
@@ -192,7 +194,8 @@ def _open_loop(ocp: OCP, controls: ArrayLike, B: int, hold: int | None, t0: floa
         raise ValueError(f"controls have shape {np.shape(controls)}; expected [B, K, nu] = [{B}, K, {ocp.system.nu}]: "
                          "one row of K held controls for each x0")
     if hold not in (None, u.shape[1]):
-        raise ValueError(f"hold is {hold}; expected {u.shape[1]}, the intervals of the controls: leave hold out")
+        raise ValueError(f"hold is {hold}, but the controls have K = {u.shape[1]} intervals; expected these: leave "
+                         "hold out")
     return (lambda x, t, k: u[:, k]), u.shape[1]
 
 

@@ -103,7 +103,7 @@ class OCP:
         for names, goal, lb, ub, what in boxes:
             for name, g, low, high in zip(names, goal, lb, ub, strict=True):
                 if not low <= g <= high:
-                    raise ValueError(f"{owner}: {what} has {name} = {g:g}, expected in its box [{low:g}, {high:g}]: "
+                    raise ValueError(f"{owner}: {what} has {name} = {g:g}, outside its box [{low:g}, {high:g}]: "
                                      "move the goal or widen the system's bounds")
 
     def _check_initial_states(self, owner: str) -> None:
@@ -292,7 +292,7 @@ class OCP:
     @staticmethod
     def from_data(data: Mapping[str, Any]) -> OCP:
         """The problem that to_data wrote, with new symbols; ValueError for anything else."""
-        checks.instance(Mapping, data, "data", "OCP.from_data", "what to_data gave")
+        checks.instance(Mapping, data, "data", "not an OCP written by nocl", "what to_data gave")
         try:
             system = System.from_data(data["system"])
             x, u = system.x, system.u

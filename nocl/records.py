@@ -18,8 +18,7 @@ from torch import Tensor
 
 from nocl.nets import MLP, FeatureNet
 from nocl.support import checks
-from nocl.support.checks import MALFORMED
-from nocl.support.store import SUFFIX, read_tensors, write_tensors
+from nocl.support.store import SUFFIX, read_tensors, reading, write_tensors
 from nocl.translate.instructions import from_data, to_data
 
 
@@ -47,14 +46,11 @@ def load(folder: str | os.PathLike[str], kind: str) -> Record:
     """What `save` wrote, bit by bit; ValueError for a missing, truncated, altered or foreign file."""
     path = _existing(folder, kind)
     tensors, structure = read_tensors(path, kind)
-    try:
+    with reading(path, f"a {kind!r} record"):
         nets = {name: _build_net(data, _below(name, tensors), f"{path}: {name}")
                 for name, data in structure["nets"].items()}
         functions = {name: from_data(data) for name, data in structure["functions"].items()}
         return Record(nets, functions, structure["card"])
-    except MALFORMED as error:
-        raise ValueError(f"{path}: {type(error).__name__} {error} in its structure; expected a {kind!r} record: "
-                         "save it again") from error
 
 
 def save_net(folder: str | os.PathLike[str], name: str, net: FeatureNet) -> Path:
@@ -120,6 +116,8 @@ def _build_net(data: Mapping[str, Any], weights: Mapping[str, Tensor], owner: st
                          f"{expected.get(key, 'no such tensor')}: the file does not fit its own structure, save it "
                          "again")
     for key, value in weights.items():
+        if not value.is_floating_point():
+            raise ValueError(f"{owner}: the tensor {key} is {value.dtype}; expected real weights: save it again")
         if not torch.isfinite(value).all():
             raise ValueError(f"{owner}: the tensor {key} holds NaN or inf; expected finite weights: what was saved is "
                              "of no use, train it again")

@@ -167,7 +167,10 @@ class System:
     def linearize(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
         """(A, B) at (x, u), as numpy arrays [nx, nx] and [nx, nu]."""
         owner = f"{self.name}.linearize"
-        A, B = self.jacobian(checks.array(x, [self.nx], "x", owner), checks.array(u, [self.nu], "u", owner))
+        A, B = self.jacobian(checks.vector(x, self.nx, "x", owner), checks.vector(u, self.nu, "u", owner))
+        if not (np.isfinite(A.full()).all() and np.isfinite(B.full()).all()):
+            raise ValueError(f"{owner}: the Jacobian is NaN or inf at x = {checks.shown(x)}, u = {checks.shown(u)}; "
+                             "expected a point where xdot is differentiable")
         return A.full(), B.full()
 
     def difference(self, other: System, equations: bool = True) -> str:
@@ -228,7 +231,7 @@ class System:
     @staticmethod
     def from_data(data: Mapping[str, Any]) -> System:
         """The system that to_data wrote, with new symbols; ValueError for anything else."""
-        checks.instance(Mapping, data, "data", "System.from_data", "what to_data gave")
+        checks.instance(Mapping, data, "data", "not a System written by nocl", "what to_data gave")
         try:
             x, u = (ca.vertcat(*map(ca.SX.sym, data[names])) for names in ("x", "u"))
             xdot = None if data["f"] is None else instructions.from_data(data["f"], [x, u])(x, u)

@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nocl.support import checks, compiler
+from nocl.support.atomic import part_of, remove_parts
 from nocl.support.checks import Array
 
 MARK = "written by nocl.to_c"  # stands in the first line of every file: only such files are overwritten
@@ -246,7 +247,7 @@ def _generate(function: ca.Function, name: str, real: str) -> tuple[str, dict[st
             raise ValueError(f"to_c: {function.name()} calls the library of {part.name()}, which has no C source; "
                              "expected CasADi expressions: export the network with backend='native'")
     options: dict[str, Any] = {"with_header": True, "casadi_int": "int", "casadi_real": real, "verbose": False}
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(dir=compiler.own_folder()) as folder:
         try:
             generator = ca.CodeGenerator(f"{name}.c", options)
             generator.add(_inner(function, name))
@@ -449,7 +450,9 @@ def _put(folder: Path, files: Mapping[str, str]) -> Path:
                              "folder")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        part = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        remove_parts(folder.parent, folder.name)
+        part = part_of(folder)
+        part.mkdir()
     except OSError as error:
         raise ValueError(f"to_c: {folder} cannot be made ({error.strerror}); expected a folder that can be written: "
                          "name another folder") from error

@@ -18,6 +18,7 @@ MALFORMED = (KeyError, IndexError, TypeError, AttributeError, NotImplementedErro
              OverflowError, MemoryError)  # what data of another form than expected raises on its way through a reader
 LARGEST = 10**9  # whole number that counts something: more is a mistake, and does not fit into memory
 ORDINARY = 1e150  # squares of larger numbers overflow
+PUBLIC = ("System", "OCP", "Dataset", "Log")  # kinds that are known by nocl's name
 Vector = Any  # a field that takes what a user writes (a list, an array) and holds a read-only Array
 
 
@@ -193,8 +194,13 @@ def flag(value: Any, name: str, owner: str) -> bool:
 def word(value: Any, among: Sequence[str], name: str, owner: str) -> str:
     """One of some words; ValueError otherwise."""
     if not isinstance(value, str) or value not in among:
-        raise ValueError(f"{owner}: {name} is {shown(value)}; expected {' or '.join(map(repr, among))}")
+        raise ValueError(f"{owner}: {name} is {shown(value)}; expected {_alternatives(among)}")
     return value
+
+
+def _alternatives(among: Sequence[str]) -> str:
+    """'a', 'b' or 'c'."""
+    return " or ".join(filter(None, [", ".join(map(repr, among[:-1])), repr(among[-1])]))
 
 
 def words(value: Any, name: str, owner: str, n: int | None = None) -> list[str]:
@@ -221,7 +227,8 @@ def folder(value: Any, name: str, owner: str) -> Path:
 def instance(kind: type, value: Any, name: str, owner: str, remedy: str = "") -> Any:
     """`value`, where it is a `kind`; ValueError otherwise."""
     if not isinstance(value, kind):
-        raise ValueError(f"{owner}: {name} is a {type(value).__name__}; expected a {kind.__name__}"
+        called = f"nocl.{kind.__name__}" if kind.__name__ in PUBLIC else kind.__name__
+        raise ValueError(f"{owner}: {name} is a {type(value).__name__}; expected a {called}"
                          f"{': ' * bool(remedy)}{remedy}")
     return value
 

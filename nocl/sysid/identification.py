@@ -29,6 +29,7 @@ from nocl.nets import MLP, FeatureNet
 from nocl.sampling import Seed
 from nocl.support import checks
 from nocl.support.checks import Array
+from nocl.support.store import reading
 from nocl.support.threads import one_thread
 from nocl.sysid import paper
 from nocl.sysid.figures import slices
@@ -153,11 +154,12 @@ class LearnedDynamics:
     def load(folder: str | Path) -> LearnedDynamics:
         """What `save` wrote, bit by bit; ValueError for a missing, altered or foreign file."""
         record = records.load(folder, KIND)
-        system = System.from_data(record.card["system"])
-        parts = _structure_from(record.card["parts"], record.functions, box_of(system))
-        coverage = record.card.get("coverage")
-        return LearnedDynamics(system, record.nets["f"].eval(), record.card["structure"], record.card["card"], parts,
-                               None if coverage is None else Coverage.from_data(coverage))
+        with reading(folder, "a model"):
+            system = System.from_data(record.card["system"])
+            parts = _structure_from(record.card["parts"], record.functions, box_of(system))
+            coverage = record.card.get("coverage")
+            return LearnedDynamics(system, record.nets["f"].eval(), record.card["structure"], record.card["card"], parts,
+                                   None if coverage is None else Coverage.from_data(coverage))
 
     def __repr__(self) -> str:
         nets = [net for net in self.net.nets if isinstance(net, MLP)]

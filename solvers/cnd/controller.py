@@ -26,6 +26,7 @@ from nocl.solvers.cnd.labels import LONGEST
 from nocl.solvers.cnd.unwrapped import Unwrapped
 from nocl.support import checks
 from nocl.support.checks import Array
+from nocl.support.store import reading
 from nocl.translate.arguments import Arguments
 from nocl.translate.torch_functions import to_torch
 
@@ -209,14 +210,10 @@ class CND:
     def load(cls, folder: str | os.PathLike[str]) -> CND:
         """What `save` wrote; raises ValueError for a missing, damaged or foreign file."""
         record = records.load(folder, KIND)
-        try:
+        with reading(folder, "a controller"):
             ocp, nets = OCP.from_data(record.card["ocp"]), record.nets
             _check_sizes(ocp, nets)
             return cls(ocp, nets["policy"], nets.get("value"), record.card["card"])
-        except KeyError as error:
-            raise ValueError(f"{folder}: not a controller written by nocl: {error} is missing") from None
-        except checks.MALFORMED as error:
-            raise ValueError(f"{folder}: not a controller written by nocl: {type(error).__name__} {error}") from None
 
     def __repr__(self) -> str:
         facts = ", ".join(f"{k} {v}" for k, v in self.card.items() if isinstance(v, (str, int, float)))
