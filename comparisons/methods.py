@@ -23,7 +23,7 @@ from nocl.data import Solution
 from nocl.judge import check_made_for, policy_function
 from nocl.ocp import OCP
 from nocl.solvers.nmpc.loop import Loop
-from nocl.support.checks import Array
+from nocl.support.checks import LARGEST, Array, shown
 
 SAMPLED = 80  # intervals that a plain callable is held on
 STAGES = 4  # evaluations of f in an RK4 step
@@ -84,7 +84,7 @@ class Solving:
 def checked(methods: Mapping[str, Any]) -> Mapping[str, Any]:
     """Methods by name, or ValueError."""
     if not isinstance(methods, Mapping) or not methods:
-        raise ValueError(f"methods is {type(methods).__name__} {methods!r}; expected a dict of methods by name, "
+        raise ValueError(f"methods is {type(methods).__name__} {shown(methods)}; expected a dict of methods by name, "
                          'like {"CND": cnd, "NMPC": nmpc}')
     for name in methods:
         if not isinstance(name, str) or not name.strip() or not name.isprintable():
@@ -97,13 +97,13 @@ def rates_of(hold: int | Sequence[int | None] | None) -> Rates:
     given = (None,) if hold is None else (None, hold) if isinstance(hold, (int, np.integer)) else hold
     if isinstance(given, str) or not isinstance(given, Sequence) or not given or \
             not all(rate is None or is_count(rate) for rate in given):
-        raise ValueError(f"hold is {hold!r}; expected a number of intervals >= 1, None for continuous feedback, or a "
-                         "list of these")
+        raise ValueError(f"hold is {shown(hold)}; expected a number of intervals >= 1, None for continuous "
+                         "feedback, or a list of these")
     return tuple(dict.fromkeys(None if rate is None else int(rate) for rate in given))
 
 
 def is_count(value: Any) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(value >= 1)
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and 1 <= int(value) <= LARGEST
 
 
 def runs_of(ocp: OCP, methods: Mapping[str, Any], x0: Array, rates: Rates, solving: Solving) -> list[MethodRun]:

@@ -77,8 +77,10 @@ def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: i
     checks.problem(ocp, "simulate")
     check_made_for(ocp, controller, "the controller")
     rows, _ = checks.states(x0, ocp.system.nx, ocp.system.name)
-    _check_options(ocp, hold, nodes, t0)
-    judge = _Judge(ocp, dynamics_function(ocp, f), rtol, atol)
+    t0 = _check_options(ocp, hold, nodes, t0)
+    for name, tolerance in (("rtol", rtol), ("atol", atol)):
+        checks.number(tolerance, name, "simulate", positive=True)
+    judge = _Judge(ocp, dynamics_function(ocp, f), float(rtol), float(atol))
     jumps = _jumps(ocp, kicks, len(rows), t0)
     policy = policy_function(ocp, controller)
     if policy is not None and hold is None:
@@ -148,38 +150,36 @@ def _with_sizes(g: ca.Function, sizes: tuple[int, int], n_out: int, what: str, f
     return g
 
 
-def _check_options(ocp: OCP, hold: int | None, nodes: int, t0: float) -> None:
-    if hold is not None and (not isinstance(hold, (int, np.integer)) or hold < 1):
-        raise ValueError(f"hold is {hold!r}; expected a number of intervals >= 1, or None for continuous feedback")
-    if not isinstance(nodes, (int, np.integer)) or nodes < 2:
-        raise ValueError(f"nodes is {nodes!r}; expected an integer >= 2")
-    if not 0 <= t0 < ocp.horizon:
-        raise ValueError(f"t0 is {t0!r}; expected 0 <= t0 < {ocp.horizon:g}, the horizon")
-
-
-def _numbers(value: ArrayLike, what: str) -> Array:
-    try:
-        return checks.real(value)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"simulate: {what} cannot be read: {error}; expected an array of numbers") from None
+def _check_options(ocp: OCP, hold: int | None, nodes: int, t0: float) -> float:
+    """t0, a float; ValueError where one of them is wrong."""
+    if hold is not None:
+        checks.whole(hold, "hold", "simulate (None: continuous feedback)", 1)
+    checks.whole(nodes, "nodes", "simulate", 2)
+    return checks.start_time(t0, ocp.horizon)
 
 
 def _check_delay(delay: float, most: float, of: str) -> None:
-    if not 0 <= delay <= most * (1 + 1e-9):
+    found = checks.finite(delay)
+    if found is None or not 0 <= found <= most * (1 + 1e-9):
         raise ValueError(f"delay is {delay!r}; expected 0 <= delay <= {most:g} for {of}")
 
 
 def _jumps(ocp: OCP, kicks: Kicks | None, B: int, t0: float) -> list[tuple[float, Array]]:
     """The kicks in order of time, as rows [B, nx]."""
     jumps = []
-    for time, dx in kicks or ():
-        d = _numbers(dx, f"the kick at t = {time:g}")
+    if not isinstance(kicks, (list, tuple, type(None))) or \
+            not all(isinstance(kick, (list, tuple)) and len(kick) == 2 for kick in kicks or ()):
+        raise ValueError(f"simulate: kicks is {checks.shown(kicks)}; expected a list of pairs (time, dx [nx] or "
+                         "[B, nx])")
+    for when, dx in kicks or ():
+        time = checks.between(when, -np.inf, np.inf, "the time of a kick", "simulate")
+        what, expected = f"the kick at t = {time:g}", f"finite ({ocp.system.nx},) or ({B}, {ocp.system.nx})"
+        d = checks.numeric(dx, what, "simulate", expected)
         if d.shape not in ((ocp.system.nx,), (B, ocp.system.nx)) or not np.isfinite(d).all():
-            raise ValueError(f"the kick at t = {time:g} has shape {d.shape}; expected finite ({ocp.system.nx},) or "
-                             f"({B}, {ocp.system.nx})")
+            raise ValueError(f"{what} has shape {d.shape}; expected {expected}")
         if not t0 <= time <= ocp.horizon:
             raise ValueError(f"a kick at t = {time:g}; expected a time in [{t0:g}, {ocp.horizon:g}]")
-        jumps.append((float(time), np.broadcast_to(d, (B, ocp.system.nx))))
+        jumps.append((time, np.broadcast_to(d, (B, ocp.system.nx))))
     return sorted(jumps, key=lambda jump: jump[0])
 
 
@@ -187,14 +187,15 @@ Ask = Callable[[Array, float, int], Array]  # (x [B, nx], t, interval) -> u [B, 
 
 
 def _open_loop(ocp: OCP, controls: ArrayLike, B: int, hold: int | None, t0: float) -> tuple[Ask, int]:
-    u = _numbers(controls, "the controls")
+    u = checks.numeric(controls, "the controls", "simulate", f"[B, K, nu] = [{B}, K, {ocp.system.nu}]")
     if u.ndim == 2 and B == 1:
         u = u[None]
     if u.ndim != 3 or u.shape[0] != B or u.shape[2] != ocp.system.nu or u.shape[1] < 1:
         raise ValueError(f"controls have shape {np.shape(controls)}; expected [B, K, nu] = [{B}, K, {ocp.system.nu}]: "
                          "one row of K held controls for each x0")
     if hold not in (None, u.shape[1]):
-        raise ValueError(f"hold is {hold}, but the controls have K = {u.shape[1]} intervals: leave hold out")
+        raise ValueError(f"hold is {hold}, but the controls have K = {u.shape[1]} intervals; expected these: leave "
+                         "hold out")
     return (lambda x, t, k: u[:, k]), u.shape[1]
 
 
@@ -205,13 +206,23 @@ def _feedback(ocp: OCP, controller: Any, policy: ca.Function | None) -> Ask:
                          "a casadi.Function, an object with to_casadi(), or controls [B, K, nu]")
 
     def ask(x: Array, t: float, k: int) -> Array:
-        u = np.asarray(controller(x, t) if policy is None else policy(x.T, t).full().T, dtype=np.float64)
+        answer = answer_of(controller, x, t) if policy is None else policy(x.T, t).full().T
+        u = checks.numeric(answer, "the controller's answer", "simulate", f"[B, nu] = [{len(x)}, {nu}]")
         if u.shape != (len(x), nu):
             raise ValueError(f"the controller answered with shape {u.shape} at t = {t:g}; expected [B, nu] = "
                              f"[{len(x)}, {nu}] for x of shape {x.shape}")
         return u
 
     return ask
+
+
+def answer_of(controller: Any, x: Array, t: float) -> Any:
+    """A callable's answer; ValueError where it does not take (x, t)."""
+    try:
+        return controller(x, t)
+    except TypeError as error:
+        raise ValueError(f"the controller raised {error} at t = {t:g}; expected a callable (x [B, nx], t) -> u [B, nu]"
+                         ) from error
 
 
 class _Judge:

@@ -67,8 +67,7 @@ class OCP:
     penalty_margin: float = field(default=0.005, kw_only=True)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.system, System):
-            raise ValueError(f"OCP: system is a {type(self.system).__name__}; expected a nocl.System")
+        checks.instance(System, self.system, "system", "OCP")
         s, owner = self.system, f"OCP on {self.system.name!r}"
         for name in ("horizon", "penalty", "penalty_margin"):
             self._set(**{name: checks.number(getattr(self, name), name, owner, positive=name == "horizon")})
@@ -177,7 +176,10 @@ class OCP:
     def from_goal(self, x: Any) -> Any:
         """x - x*, from the nearest image of the goal: numpy rows [..., nx], or a CasADi column [nx]."""
         if not isinstance(x, (ca.SX, ca.MX)):
-            rows = np.asarray(x, dtype=np.float64) - self.x_goal
+            given = checks.numeric(x, "x", "from_goal", f"numbers [..., {self.system.nx}]")
+            if given.shape[-1:] != (self.system.nx,):
+                raise ValueError(f"from_goal: x has shape {given.shape}; expected [..., {self.system.nx}]")
+            rows = given - self.x_goal
             for i in self.periodic:
                 rows[..., i] -= 2 * np.pi * np.round(rows[..., i] / (2 * np.pi))
             return rows
@@ -204,7 +206,7 @@ class OCP:
 
         R and P are numbers (times the identity), diagonals [n] or symmetric positive semidefinite matrices [n, n].
         """
-        owner = f"OCP on {system.name!r}"
+        owner = f"OCP on {checks.instance(System, system, 'system', 'OCP.quadratic').name!r}"
         du = system.u - ca.DM(checks.vector(u_goal, system.nu, "u_goal", owner))
         dx = system.x - ca.DM(checks.vector(x_goal, system.nx, "x_goal", owner))
         return cls(system, running=_quadratic(checks.weight(R, system.nu, "R", owner), du),
@@ -245,13 +247,21 @@ class OCP:
 
     def least(self, x: Array) -> Array:
         """The least value [B, number of them] of each path constraint along states x [B, n, nx]; inf for NaN."""
+        n = self.system.nx
+        x = checks.numeric(x, "x", "OCP.least", f"states [B, n, {n}]")
+        if x.ndim != 3 or x.shape[2] != n or not x.size:
+            raise ValueError(f"OCP.least: x has shape {x.shape}; expected [B, n, {n}]")
         if not self.path_constraints:
             return np.full((len(x), 0), np.inf)
-        h = self.h(x.reshape(-1, x.shape[2]).T).full().reshape(len(self.path_constraints), *x.shape[:2])
+        h = self.h(x.reshape(-1, n).T).full().reshape(len(self.path_constraints), *x.shape[:2])
         return np.where(np.isfinite(h), h, np.inf).min(axis=2, initial=np.inf).T
 
     def violation(self, least: Array) -> Array:
         """The largest violation of a path constraint as a share of its scale [B], of least values [B, m]; 0: none."""
+        m = len(self.path_constraints)
+        least = checks.numeric(least, "least", "OCP.violation", f"least values [B, {m}]")
+        if least.ndim != 2 or least.shape[1] != m or np.isnan(least).any():
+            raise ValueError(f"OCP.violation: least is {checks.shown(least)}; expected [B, {m}], as OCP.least gives it")
         return np.asarray((-least / self.constraint_scales).max(axis=1, initial=0.0)) + 0.0
 
     @property
@@ -283,6 +293,7 @@ class OCP:
     @staticmethod
     def from_data(data: Mapping[str, Any]) -> OCP:
         """The problem that to_data wrote, with new symbols; ValueError for anything else."""
+        checks.instance(Mapping, data, "data", "not an OCP written by nocl", "what to_data gave")
         try:
             system = System.from_data(data["system"])
             x, u = system.x, system.u
@@ -294,7 +305,8 @@ class OCP:
                        path_constraints=dict(zip(data["path_constraints"], constraints, strict=True)),
                        penalty=data["penalty"], penalty_margin=data["penalty_margin"])
         except MALFORMED as error:
-            raise ValueError(f"not an OCP written by nocl: {type(error).__name__}: {error}") from error
+            raise ValueError(f"not an OCP written by nocl: {type(error).__name__}: {error}; expected what to_data "
+                             "gave") from error
 
     def __reduce__(self) -> tuple[Any, ...]:
         return OCP.from_data, (self.to_data(),)  # bare SX does not pickle

@@ -168,15 +168,20 @@ class System:
         """(A, B) at (x, u), as numpy arrays [nx, nx] and [nx, nu]."""
         owner = f"{self.name}.linearize"
         A, B = self.jacobian(checks.vector(x, self.nx, "x", owner), checks.vector(u, self.nu, "u", owner))
+        if not (np.isfinite(A.full()).all() and np.isfinite(B.full()).all()):
+            raise ValueError(f"{owner}: the Jacobian is NaN or inf at x = {checks.shown(x)}, u = {checks.shown(u)}; "
+                             "expected a point where xdot is differentiable")
         return A.full(), B.full()
 
     def difference(self, other: System, equations: bool = True) -> str:
         """What tells another system from this one, names or (where asked) equations; "" where they are the same."""
+        checks.instance(System, other, "other", f"{self.name}.difference", "of an OCP, pass ocp.system")
         for what, own, theirs in (("states", self.state_names, other.state_names),
                                   ("controls", self.control_names, other.control_names)):
             if own != theirs:
                 return f"its {what} are {', '.join(theirs)}, not {', '.join(own)}"
-        if not equations or self.xdot is None or other.xdot is None or self.xdot is other.xdot:
+        known = self.xdot is not None and other.xdot is not None
+        if not checks.flag(equations, "equations", f"{self.name}.difference") or not known or self.xdot is other.xdot:
             return ""
         rng = np.random.default_rng(0)
         x = rng.uniform(self.lbx, self.ubx, (N_SAME, self.nx)).T
@@ -188,11 +193,17 @@ class System:
 
     def under(self, f: ca.Function) -> System:
         """The system with another f:(x, u) -> xdot for its equations, in its own symbols: f is written out in SX."""
-        f = f if f.is_a("SXFunction") else f.expand()
+        sizes = [self.nx, self.nu]
+        if not isinstance(f, ca.Function) or [f.numel_in(i) for i in range(f.n_in())] != sizes or \
+                [f.numel_out(i) for i in range(f.n_out())] != [self.nx]:
+            raise ValueError(f"{self.name}.under: f is {checks.shown(f)}; expected a casadi.Function (x [{self.nx}], "
+                             f"u [{self.nu}]) -> xdot [{self.nx}]")
+        f = f if f.is_a("SXFunction") else instructions.expand(f)
         return replace(self, xdot=f(*self.arguments.inputs))
 
     def unit(self, name: str) -> str:
         """The unit of a state or control for an axis label, like 'theta [rad]' or just 'theta'."""
+        checks.word(name, self.names, "name", f"{self.name}.unit")
         return f"{name} [{self.units[name]}]" if name in self.units else name
 
     def __repr__(self) -> str:
@@ -220,13 +231,15 @@ class System:
     @staticmethod
     def from_data(data: Mapping[str, Any]) -> System:
         """The system that to_data wrote, with new symbols; ValueError for anything else."""
+        checks.instance(Mapping, data, "data", "not a System written by nocl", "what to_data gave")
         try:
             x, u = (ca.vertcat(*map(ca.SX.sym, data[names])) for names in ("x", "u"))
             xdot = None if data["f"] is None else instructions.from_data(data["f"], [x, u])(x, u)
             return System(data["name"], x=x, u=u, xdot=xdot, angles=data["angles"], units=data["units"],
                           **{name: data[name] for name in ("lbu", "ubu", "lbx", "ubx")})
         except MALFORMED as error:
-            raise ValueError(f"not a System written by nocl: {type(error).__name__}: {error}") from error
+            raise ValueError(f"not a System written by nocl: {type(error).__name__}: {error}; expected what to_data "
+                             "gave") from error
 
     @staticmethod
     def from_casadi(f: ca.Function, *, lbu: Vector, ubu: Vector, lbx: Vector, ubx: Vector, **options: Any) -> System:
@@ -249,14 +262,14 @@ def _from_casadi(f: ca.Function, *, name: str | None = None, states: Sequence[st
                          "columns")
     x = _named(states, f.size1_in(0), "x", "states", f.name())
     u = _named(controls, f.size1_in(1), "u", "controls", f.name())
-    return System(name or f.name(), x=x, u=u, xdot=instructions.expand(f)(x, u), **options)
+    return System(f.name() if name is None else name, x=x, u=u, xdot=instructions.expand(f)(x, u), **options)
 
 
 def _named(names: Sequence[str] | None, n: int, letter: str, what: str, owner: str) -> ca.SX:
     """A column of n symbols: `names`, or x0, x1, ..."""
-    chosen = [f"{letter}{i}" for i in range(n)] if names is None else list(names)
+    chosen = [f"{letter}{i}" for i in range(n)] if names is None else checks.words(names, what, "System.from_casadi")
     if len(chosen) != n:
-        raise ValueError(f"System.from_casadi: {what} has {len(chosen)} names; {owner} has {n}: name each")
+        raise ValueError(f"System.from_casadi: {what} has {len(chosen)} names; {owner} has {n}: give each a name")
     return ca.vertcat(*map(ca.SX.sym, chosen))
 
 

@@ -54,6 +54,7 @@ class LQR:
 
     def __init__(self, ocp: OCP, infinite: bool = False) -> None:
         checks.problem(ocp, "LQR")
+        infinite = checks.flag(infinite, "infinite", "LQR")
         self.ocp, self.infinite = ocp, infinite
         self.A, self.B = (j.full() for j in ocp.functions.jacobian(ocp.x_goal, ocp.u_goal))
         self.Q, self.R, self.S, self.P_final = _hessians(ocp)
@@ -116,12 +117,16 @@ class LQR:
     def _gain(self, P: Array) -> Array:
         return np.asarray(np.linalg.solve(self.R, self.B.T @ P + self.S.T), dtype=np.float64)
 
+    def _time(self, t: Any) -> float:
+        """t as a float: any finite time."""
+        return checks.between(t, -np.inf, np.inf, "t", f"LQR of {self.ocp.system.name!r}")
+
     def P(self, t: float = 0.0) -> Array:
         """The Hessian of V at time t, [nx, nx]."""
         if self.infinite:
             return self._P_infinite
         n = len(self.A)
-        P = self._spline(min(max(float(t), 0.0), self.ocp.horizon)).reshape(n, n)
+        P = self._spline(min(max(self._time(t), 0.0), self.ocp.horizon)).reshape(n, n)
         return (P + P.T) / 2
 
     def K(self, t: float = 0.0) -> Array:
@@ -142,7 +147,7 @@ class LQR:
         """
         rows, single = checks.states(x, self.ocp.system.nx, self.ocp.system.name, "x")
         d = self.ocp.from_goal(rows)
-        rest = 0.0 if self.infinite else self._L_goal * (self.ocp.horizon - t) + self._G_goal
+        rest = 0.0 if self.infinite else self._L_goal * (self.ocp.horizon - self._time(t)) + self._G_goal
         V = np.einsum("bi,ij,bj->b", d, self.P(t), d) / 2 + rest
         return float(V[0]) if single else V
 

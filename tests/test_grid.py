@@ -137,8 +137,8 @@ def test_what_no_explicit_step_can_follow_is_said_to_be():
 @pytest.mark.parametrize("name", NAMES)
 def test_the_problems_that_come_with_nocl_need_one_step(name):
     ocp = nocl.load_ocp(name)
-    assert substeps_for(ocp, None, 80, WANTED) == 1
-    assert WANTED < COARSE
+    assert substeps_for(ocp, None, 80, FINE) == 1
+    assert WANTED < FINE < COARSE
 
 
 def test_a_log_whose_samples_are_far_apart_is_fitted_by_shorter_steps():

@@ -9,9 +9,11 @@ import threading
 import time
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 
+import nocl
 from nocl.solvers import NMPC
 from nocl.solvers.nmpc.solver import shared_program
 from nocl.solvers.nmpc.transcription import Transcription
@@ -182,3 +184,15 @@ def test_patience_grows_with_what_solves_take():
     assert program.patience >= 10.0
     program._took[0] = 7.0
     assert program.patience >= 140.0
+
+
+def test_a_cost_that_is_not_finite_is_not_solved():
+    """fatrop says "solved" where the cost is NaN on every way from the state."""
+    p, v, u = ca.SX.sym("p"), ca.SX.sym("v"), ca.SX.sym("u")
+    s = nocl.System("mass", x=ca.vertcat(p, v), u=u, xdot=ca.vertcat(v, u), lbu=[-1], ubu=[1], lbx=[-5, -5], ubx=[5, 5])
+    ocp = nocl.OCP(s, horizon=3.0, running=u**2 + ca.log(4 + p), terminal=p**2 + v**2, x_goal=[0, 0], u_goal=[0],
+                   initial_states=nocl.Gaussian([0.5, 0], [0.1, 0.1]))
+    found = NMPC(ocp, 20, starts=2, passes=0).solve([-4.5, -2.0], workers=1)
+    assert not found.success[0]
+    assert np.isinf(found.cost[0])
+    assert "not finite" in found.message[0] or "NaN" in found.message[0]

@@ -21,7 +21,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import IO, Any
 
-from nocl.support.atomic import write_bytes
+from nocl.support.atomic import remove_parts, write_bytes
 from nocl.support.fingerprint import fingerprint, sha256
 
 CACHE_VARIABLE = "NOCL_CACHE"  # names a folder for libraries; without it they live as long as the process
@@ -82,7 +82,9 @@ def shared_library(kind: str, identity: Sequence[Any], build: Callable[[Path], P
         return found
     with tempfile.TemporaryDirectory(dir=own_folder()) as scratch:  # a kill while building leaves the cache as it was
         content = build(Path(scratch)).read_bytes()
-    return write_bytes(folder / _file(name, content), content, durable=False)
+    path = write_bytes(folder / _file(name, content), content, durable=False)
+    remove_parts(folder)
+    return path
 
 
 def cache_folder(named: str | os.PathLike[str] | None = None) -> Path:

@@ -29,6 +29,7 @@ from nocl.nets import MLP, FeatureNet
 from nocl.sampling import Seed
 from nocl.support import checks
 from nocl.support.checks import Array
+from nocl.support.store import reading
 from nocl.support.threads import one_thread
 from nocl.sysid import paper
 from nocl.sysid.figures import slices
@@ -153,11 +154,12 @@ class LearnedDynamics:
     def load(folder: str | Path) -> LearnedDynamics:
         """What `save` wrote, bit by bit; ValueError for a missing, altered or foreign file."""
         record = records.load(folder, KIND)
-        system = System.from_data(record.card["system"])
-        parts = _structure_from(record.card["parts"], record.functions, box_of(system))
-        coverage = record.card.get("coverage")
-        return LearnedDynamics(system, record.nets["f"].eval(), record.card["structure"], record.card["card"], parts,
-                               None if coverage is None else Coverage.from_data(coverage))
+        with reading(folder, "a model"):
+            system = System.from_data(record.card["system"])
+            parts = _structure_from(record.card["parts"], record.functions, box_of(system))
+            coverage = record.card.get("coverage")
+            return LearnedDynamics(system, record.nets["f"].eval(), record.card["structure"], record.card["card"], parts,
+                                   None if coverage is None else Coverage.from_data(coverage))
 
     def __repr__(self) -> str:
         nets = [net for net in self.net.nets if isinstance(net, MLP)]
@@ -206,7 +208,7 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
     UserWarning
         Where the labels speak against what is stated.
     """
-    settings = _check_arguments(system, method, settings, seed, data)
+    settings = _check_arguments(system, method, gradients, settings, seed, data)
     stated, start, bar = Stated.of(system, known, control_affine), time.perf_counter(), Progress(system.name, progress)
     if isinstance(data, Log):
         assert isinstance(settings, LogSettings)
@@ -284,15 +286,15 @@ def _check_stated(stated: Stated, method: str) -> None:
                          "the default method")
 
 
-def _check_arguments(system: System, method: str, settings: Settings | PaperSettings | LogSettings | None, seed: int,
+def _check_arguments(system: System, method: str, gradients: bool,
+                     settings: Settings | PaperSettings | LogSettings | None, seed: int,
                      data: Dataset | Log | None) -> Settings | PaperSettings | LogSettings:
-    if not isinstance(system, System):
-        raise ValueError(f"identify: system is a {type(system).__name__}; expected a nocl.System: "
-                         "of an OCP, pass ocp.system")
-    if method not in RECIPES:
-        raise ValueError(f"identify: method is {method!r}; expected one of {', '.join(RECIPES)}")
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ValueError(f"identify: seed is {seed!r}; expected an integer >= 0")
+    checks.instance(System, system, "system", "identify", "of an OCP, pass ocp.system")
+    checks.word(method, RECIPES, "method", "identify")
+    checks.whole(seed, "seed", "identify", most=2**62)
+    checks.flag(gradients, "gradients", "identify")
+    if data is not None and not isinstance(data, (Dataset, Log)):
+        raise ValueError(f"identify: data is a {type(data).__name__}; expected a nocl.Dataset or a nocl.Log")
     if isinstance(data, Log) and method != "default":
         raise ValueError(f"identify: method is {method!r}; logs take 'default' only: leave it out")
     expected = LogSettings if isinstance(data, Log) else PaperSettings if method == "paper" else Settings

@@ -54,7 +54,7 @@ from nocl.solvers.ddp.bank import SolutionBank, extend
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP, substeps_for
 from nocl.substeps import FINE
-from nocl.support import store
+from nocl.support import checks, store
 from nocl.support.checks import Array
 from nocl.support.threads import one_thread
 from nocl.translate.torch_functions import to_torch
@@ -91,22 +91,19 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
         Whether to show progress; by default where the terminal is one.
     """
     _check(ocp, dynamics, seed, out)
+    checks.word(method, ("default", "paper"), "method", "train")
     if method == "paper":
         chosen = _expect(settings, PaperSettings)
         checkpoint = None if out is None else Path(out) / CHECKPOINT
         policy, value, card = train_paper(ocp, dynamics, chosen, seed=seed, progress=progress, checkpoint=checkpoint)
         return CND(ocp, policy, value, card)
-    if method != "default":
-        raise ValueError(f"train: method is {method!r}; expected 'default' or 'paper'")
     ocp.check_strict("train")
     return Training(ocp, dynamics, _expect(settings, TrainSettings), seed, out, progress).run()
 
 
 def _check(ocp: OCP, dynamics: LearnedDynamics | None, seed: int, out: str | os.PathLike[str] | None) -> None:
-    if not isinstance(ocp, OCP):
-        raise ValueError(f"train: ocp is a {type(ocp).__name__}; expected a nocl.OCP")
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**62:
-        raise ValueError(f"train: seed is {seed!r}; expected a whole number from 0 to 2**62")
+    checks.instance(OCP, ocp, "ocp", "train", "nocl.load_ocp(name)")
+    checks.whole(seed, "seed", "train", most=2**62)
     if out is not None and Path(out).exists() and not Path(out).is_dir():
         raise ValueError(f"train: out is the file {out}; expected a folder for checkpoints")
     if dynamics is not None and not hasattr(dynamics, "system"):

@@ -94,10 +94,10 @@ class DDP:
         checks.problem(ocp, "DDP")
         for name, value in (("intervals", intervals), ("substeps", 1 if substeps is None else substeps),
                             ("threads", 1 if threads is None else threads)):
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-                raise ValueError(f"DDP: {name} is {value!r}; expected an integer >= 1")
-        if constraints not in ("hard", "soft"):
-            raise ValueError(f"DDP: constraints is {constraints!r}; expected 'hard' or 'soft'")
+            checks.whole(value, name, "DDP", 1)
+        checks.word(constraints, ("hard", "soft"), "constraints", "DDP")
+        if settings is not None:
+            checks.instance(DDPSettings, settings, "settings", "DDP", "DDPSettings(max_iterations=...)")
         self.ocp, self.intervals, self.settings = ocp, int(intervals), settings or DDPSettings()
         self.constraints, self.dynamics, self.cache = constraints, dynamics, cache
         self.checked = False  # whether the grid was held against the plant
@@ -137,6 +137,7 @@ class DDP:
         """
         rows, _ = checks.states(x0, self.ocp.system.nx, self.ocp.system.name)
         rows = np.ascontiguousarray(rows)
+        curvature = checks.flag(curvature, "curvature", "DDP.solve")
         times, (pool, here) = self._start_times(t0, len(rows)), self._where(workers)
         guess = self._guesses(len(rows), u=u, x=x, gain=gain)
         journal = Journal(None if out is None else Path(out), self._run_key(rows, times, guess, curvature) if out
@@ -212,7 +213,7 @@ class DDP:
         return fingerprint(self.key, x0, t0, *(part for pair in sorted(guess.items()) for part in pair), curvature)
 
     def _start_times(self, t0: ArrayLike, B: int) -> Array:
-        given = np.asarray(t0, dtype=np.float64)
+        given = checks.numeric(t0, "t0", "DDP.solve", f"a number, or one for each of the {B} states")
         if given.shape not in ((), (1,), (B,)):
             raise ValueError(f"t0 has shape {given.shape}; expected a number, or one for each of the {B} states")
         times = np.broadcast_to(given, (B,)).copy()
@@ -399,7 +400,7 @@ def _fitting(ocp: OCP, dynamics: LearnedDynamics) -> Any:
 
 
 def _shaped(value: Array, shape: tuple[int, ...], name: str) -> Array:
-    array = np.ascontiguousarray(value, dtype=np.float64)
+    array = np.ascontiguousarray(checks.numeric(value, f"the guess {name}", "DDP", f"{list(shape)}", copy=False))
     if array.shape != shape:
         raise ValueError(f"DDP: the guess {name} has shape {array.shape}; expected {shape}, a row for each x0")
     return array

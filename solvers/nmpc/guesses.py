@@ -6,10 +6,12 @@ import casadi as ca
 import numpy as np
 
 from nocl.data import Controller
+from nocl.judge import answer_of
 from nocl.ocp import OCP
 from nocl.solvers.lqr import LQR
 from nocl.solvers.nmpc.transcription import Transcription
 from nocl.solvers.starts import HALVINGS, near, random_controls
+from nocl.support import checks
 from nocl.support.checks import Array
 
 Guess = tuple[Array, Array]
@@ -82,7 +84,10 @@ def controller_rollout(program: Transcription, controller: Controller, x0: Array
     s, N = program.ocp.system, program.N
     x, u = np.tile(x0, (N + 1, 1)), np.tile(program.ocp.u_goal, (N, 1))
     for k in range(N):
-        control = np.clip(np.asarray(controller(x[k], float(t[k])), dtype=np.float64).reshape(s.nu), s.lbu, s.ubu)
+        answer = checks.numeric(answer_of(controller, x[k], float(t[k])), "the guess's answer", "NMPC", f"u [{s.nu}]")
+        if answer.size != s.nu:
+            raise ValueError(f"NMPC: the guess's answer has shape {answer.shape}; expected u [{s.nu}]")
+        control = np.clip(answer.reshape(s.nu), s.lbu, s.ubu)
         end = program.step(x[k], control, t[k + 1] - t[k])[0].full().ravel()
         if not (np.isfinite(control).all() and np.isfinite(end).all()):
             x[k + 1:] = x[k]

@@ -87,18 +87,19 @@ class NMPC:
     def __post_init__(self) -> None:
         checks.problem(self.ocp, "NMPC")
         for name, least in (("intervals", 2), ("substeps", 1), ("starts", 1), ("passes", 0), ("neighbours", 1)):
-            value = getattr(self, name)
-            if name == "substeps" and value is None:
-                continue
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-                raise ValueError(f"NMPC: {name} is {value!r}; expected an integer >= {least}")
-        if self.constraints not in ("hard", "soft"):
-            raise ValueError(f"NMPC: constraints is {self.constraints!r}; expected 'hard' or 'soft'")
-        if self.solver not in BACKENDS and not ca.has_nlpsol(self.solver):
+            if name != "substeps" or self.substeps is not None:
+                checks.whole(getattr(self, name), name, "NMPC", least)
+        checks.whole(self.seed, "seed", "NMPC", most=2**63)
+        checks.word(self.constraints, ("hard", "soft"), "constraints", "NMPC")
+        if not isinstance(self.solver, str) or (self.solver not in BACKENDS and not _known(self.solver)):
             raise ValueError(f"NMPC: solver is {self.solver!r}; expected {' or '.join(BACKENDS)}, or an nlpsol "
                              "that this CasADi has")
-        if self.compiled == "" or not isinstance(self.compiled, (bool, str, os.PathLike)):
-            raise ValueError(f"NMPC: compiled is {self.compiled!r}; expected True, False, or a folder")
+        if not isinstance(self.compiled, bool):
+            checks.folder(self.compiled, "compiled (True, False, or a folder)", "NMPC")
+        if self.options is not None and not (isinstance(self.options, Mapping)
+                                             and all(isinstance(key, str) for key in self.options)):
+            raise ValueError(f"NMPC: options is {checks.shown(self.options)}; expected a dict of options of the "
+                             'nlpsol by name, like {"ipopt.tol": 1e-6}')
         if checks.number(self.window, "horizon", "NMPC", positive=True) > self.ocp.horizon:
             raise ValueError(f"NMPC: horizon is {self.horizon!r}; expected at most {self.ocp.horizon:g}, the OCP's")
         if self.time_limit is not None:
@@ -187,7 +188,8 @@ class NMPC:
         tried = [one for one in (guesses if isinstance(guesses, list) else [guesses]) if one is not None]
         tried.sort(key=lambda one: not _is_solution(one))
         given, warm = [_given(one, self, rows, t) for one in tried], sum(map(_is_solution, tried))
-        n = starts if starts is not None else (0 if given else self.starts)
+        n = checks.whole(starts, "starts", "NMPC.solve") if starts is not None else (0 if given else self.starts)
+        gains = checks.flag(gains, "gains", "NMPC.solve")
         if n < 1 and not given:
             raise ValueError(f"starts is {n}; expected at least 1, or guesses")
         show = sys.stderr.isatty() if progress is None else progress
@@ -260,9 +262,9 @@ class NMPC:
 
     def _nodes(self, t0: float, nodes: ArrayLike | None) -> Array:
         T, N = self.ocp.horizon, self.intervals
-        if not 0 <= t0 < T:
-            raise ValueError(f"t0 is {t0!r}; expected 0 <= t0 < {T:g}, the horizon")
-        t = np.linspace(t0, min(t0 + self.window, T), N + 1) if nodes is None else np.asarray(nodes, dtype=np.float64)
+        t0 = checks.start_time(t0, T)
+        t = np.linspace(t0, min(t0 + self.window, T), N + 1) if nodes is None else \
+            checks.array(nodes, [N + 1], "nodes", "NMPC.solve")
         if t.shape != (N + 1,) or not (np.diff(t) > 0).all() or t[0] < 0 or t[-1] > T * (1 + 1e-9):
             raise ValueError(f"nodes have shape {t.shape}; expected N + 1 = {N + 1} rising times in [0, {T:g}]")
         if self.horizon is None and t[-1] < T * (1 - 1e-9):
@@ -274,6 +276,14 @@ class NMPC:
         arrays = [part for guess in given for row in guess for part in row]
         return fingerprint(self.key, x0, t, *arrays, counts, self.passes, self.neighbours, self.seed, self.time_limit,
                            version("casadi"), version("nocl"))
+
+
+def _known(solver: str) -> bool:
+    """Whether this CasADi has an nlpsol of that name."""
+    try:
+        return bool(solver.isidentifier() and ca.has_nlpsol(solver))
+    except RuntimeError:
+        return False
 
 
 def closed_loop(ocp: OCP, intervals: int, seed: int, substeps: int | None = None) -> Loop:
@@ -411,6 +421,8 @@ def _given(guess: Any, nmpc: NMPC, x0: Array, t: Array) -> list[Guess]:
     """A user's guess, checked: states and controls for each x0."""
     s, N, B = nmpc.ocp.system, nmpc.intervals, len(x0)
     check_made_for(nmpc.ocp, guess, "NMPC: the guess")
+    if isinstance(guess, tuple) and len(guess) != 2:
+        raise ValueError(f"NMPC: the guess is a tuple of {len(guess)}; expected (x [B, N+1, nx], u [B, N, nu])")
     if callable(guess) and not isinstance(guess, Solution):
         return [starting.controller_rollout(nmpc.program, guess, row, t) for row in x0]
     x, u = (guess.x, guess.u) if hasattr(guess, "x") and hasattr(guess, "u") else \
@@ -427,7 +439,7 @@ def _rollout(program: Transcription, x0: Array, u: Array, t: Array) -> Guess:
 
 
 def _shaped(value: ArrayLike, shape: tuple[int, ...], what: str, form: str) -> Array:
-    array = np.asarray(value, dtype=np.float64)
+    array = checks.numeric(value, what, "NMPC", f"{form} = {list(shape)}", copy=False)
     if array.ndim == 2 and shape[0] == 1:
         array = array[None]
     if array.shape != shape:

@@ -64,7 +64,6 @@ class Answer:
     iterations: int
     outcome: str  # how it ended: a key of OUTCOMES, GIVEN_UP, or CasADi's own name
 
-
     @property
     def rank(self) -> tuple[bool, float]:
         """Of failures: the one that says that there is no solution comes first, then the most feasible."""
@@ -286,13 +285,16 @@ class Transcription:
         worst, where = self.violation(result["g"].full().ravel(), t)
         iterations = int(stats.get("iter_count", 0))
         outcome = outcome_of(stats, iterations >= self.max_iter)
+        cost = float(result["f"]) * scales.cost
+        finite = bool(np.isfinite(cost) and np.isfinite(X).all())
+        if stats["success"] and not finite:  # fatrop calls a cost of NaN solved
+            outcome = NOT_A_NUMBER
         status = words(stats, outcome)
-        success = bool(stats["success"] and worst <= FEASIBLE and np.isfinite(X).all())
+        success = bool(stats["success"] and worst <= FEASIBLE and finite)
         if not success:
             status += f"; worst violation {where}" if worst > FEASIBLE else \
                 ", at a feasible point that may not be optimal"
-        cost = float(result["f"]) * scales.cost if success else np.inf
-        return Answer(X, U, costate, cost, success, status, worst, iterations, outcome)
+        return Answer(X, U, costate, cost if success else np.inf, success, status, worst, iterations, outcome)
 
     @property
     def max_iter(self) -> float:
