@@ -35,8 +35,8 @@ def refused(load: Callable[[], Any]) -> str:
     try:
         load()
     except ValueError as error:
-        text = str(error)
-        return "" if any(w in text for w in ("expected", "outside its box", "save it again", "take a copy", "name")) else f"raw: {text}"
+        ours = ("expected", "outside its box", "save it again", "take a copy", "name")
+        return "" if any(word in str(error) for word in ours) else f"raw: {error}"
     except BaseException as error:
         return f"{type(error).__name__}: {error}"
     return "was loaded"

@@ -158,7 +158,8 @@ class LearnedDynamics:
             system = System.from_data(record.card["system"])
             parts = _structure_from(record.card["parts"], record.functions, box_of(system))
             coverage = record.card.get("coverage")
-            return LearnedDynamics(system, record.nets["f"].eval(), record.card["structure"], record.card["card"], parts,
+            card = record.card["card"]
+            return LearnedDynamics(system, record.nets["f"].eval(), record.card["structure"], card, parts,
                                    None if coverage is None else Coverage.from_data(coverage))
 
     def __repr__(self) -> str:
