@@ -218,8 +218,8 @@ def test_an_interrupted_solve_goes_on(here, monkeypatch):
     """DDP's stages and NMPC's states so far are kept until all is solved."""
     from nocl.solvers.ddp.solver import DDP
 
-    command = ["solve", "cubic.py", "--solver", "ddp", "--n", "4", "--intervals", "9", "--substeps", "1", "--workers", "1",
-               "--out", "new"]
+    command = ["solve", "cubic.py", "--solver", "ddp", "--n", "4", "--intervals", "9", "--substeps", "1", "--workers",
+               "1", "--out", "new"]
     done, left, descend = [], [5], DDP.descend
 
     def counted(self, batch):
