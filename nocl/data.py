@@ -15,7 +15,7 @@ from nocl.support.checks import Array
 from nocl.system import System
 
 SAME = 1e-3  # costs closer than this, relative, count as the same optimum
-TINY = 1e-10  # ... and absolute: costs below it are equal
+TINY = 1e-10  # ... and of the usual cost: below that, costs are equal
 ROUNDING = 1e-9  # of the time that a solution spans
 
 
@@ -111,6 +111,7 @@ class Solution:
     iterations: NDArray[np.int64]  # [B], of all that was tried
     V_xx: Array | None = None  # [B, K+1, nx, nx]
     tried: Array | None = None  # [B, n], the cost that each start ended at: inf, it failed; NaN, there were fewer
+    unit: Array | None = None  # [B], what costs of the problem usually are
     clearance: Array | None = None  # [B], min of all path constraints at the nodes; inf where there are none
     dense: Array | None = None  # [B, K, 4, 2 nx]: (x, costate) at both ends of intervals, their time derivatives
 
@@ -138,16 +139,23 @@ class Solution:
     @property
     def hits(self) -> NDArray[np.int64]:
         """How many of them ended at the best cost, SAME apart at most [B]."""
-        return hits(self._tried, self.cost)
+        return hits(self._tried, self.cost, self._unit)
 
     @property
     def optima(self) -> list[Array]:
         """The costs of the local optima found, rising, and how many starts ended at each: [n, 2] for each row."""
-        return [distinct(costs) for costs in self._tried]
+        return [distinct(costs, unit) for costs, unit in zip(self._tried, self._unit, strict=True)]
 
     @property
     def _tried(self) -> Array:
         return self.cost[:, None] if self.tried is None else self.tried
+
+    @property
+    def _unit(self) -> Array:
+        """The usual cost of each row; where it is not known, the largest that was found."""
+        found = np.abs(self._tried)
+        most = found[np.isfinite(found)].max(initial=0.0)
+        return np.full(len(self), most) if self.unit is None else np.where(np.isnan(self.unit), most, self.unit)
 
     def __getitem__(self, rows: Any) -> Solution:
         """The solutions of some rows: a number, a slice, a mask or indices."""
@@ -239,18 +247,21 @@ class Solution:
         return np.clip(k - 1, 0, self.u.shape[1] - 1)
 
 
-def distinct(costs: Array) -> Array:
-    """(cost, how many reached it) of each local optimum among costs, rising [n, 2]; inf and NaN stand for none."""
+def distinct(costs: Array, unit: float) -> Array:
+    """(cost, how many reached it) of each local optimum among costs, rising [n, 2]; inf and NaN stand for none.
+
+    unit : the usual cost
+    """
     found = np.sort(costs[np.isfinite(costs)])
     if not found.size:
         return np.zeros((0, 2))
-    first = np.r_[True, np.diff(found) > np.maximum(SAME * np.abs(found[1:]), TINY)]
+    first = np.r_[True, np.diff(found) > np.maximum(SAME * np.abs(found[1:]), TINY * unit)]
     return np.c_[found[first], np.diff(np.r_[np.flatnonzero(first), len(found)])]
 
 
-def hits(tried: Array, best: Array) -> NDArray[np.int64]:
-    """How many of the costs tried [B, n] are the best [B]."""
-    near = tried <= (best + np.maximum(SAME * np.abs(best), TINY))[:, None]
+def hits(tried: Array, best: Array, unit: Array | float) -> NDArray[np.int64]:
+    """How many of the costs tried [B, n] are the best [B]; unit: the usual cost."""
+    near = tried <= (best + np.maximum(SAME * np.abs(best), TINY * unit))[:, None]
     return (near & np.isfinite(tried)).sum(axis=1)
 
 

@@ -24,6 +24,7 @@ from scipy.spatial import KDTree
 
 from nocl.data import TINY, Solution, hits
 from nocl.ocp import OCP
+from nocl.scales import usual_sizes
 from nocl.solvers.mirrors import Mirror, mirrored
 from nocl.support.checks import Array
 
@@ -90,6 +91,7 @@ class Search:
                  rounds: int, seed: int, known: Solution | None = None) -> None:
         self.solver, self.ocp, self.mirrors, self.x0, self.t = solver, ocp, mirrors, x0, t
         self.neighbours, self.rounds, self.seed = neighbours, rounds, seed
+        self.unit = usual_sizes(ocp).cost
         self.best = Solution.blank(np.tile(t, (len(x0), 1)), x0.shape[1], ocp.system.nu)
         self.seconds, self.iterations = np.zeros(len(x0)), np.zeros(len(x0), dtype=np.int64)
         self.owners, self.costs = [np.zeros(0, dtype=np.int64)], [np.zeros(0)]  # of each start: its state, how it ended
@@ -105,7 +107,7 @@ class Search:
         self.solver.begin(self.stages, what)
         former = self.best.cost.copy()
         run(*args)
-        self.improving = bool(_improved(former, self.best.cost).any())
+        self.improving = bool(_improved(former, self.best.cost, self.unit).any())
 
     def improve(self, starts: int) -> None:
         """Rounds until one improves nothing; fresh cold starts are numbered from `starts` on."""
@@ -166,7 +168,7 @@ class Search:
     def _doubtful(self) -> Rows:
         """States whose best was found seldom, and a random SHARE of the others."""
         tried = self._tried()
-        seldom = hits(tried, self.best.cost) < np.maximum(TWICE, SURE * (~np.isnan(tried)).sum(axis=1))
+        seldom = hits(tried, self.best.cost, self.unit) < np.maximum(TWICE, SURE * (~np.isnan(tried)).sum(axis=1))
         return np.flatnonzero((self.rng.random(len(self.x0)) < SHARE) | seldom)
 
     def guess(self, moves: Moves) -> Guess:
@@ -228,7 +230,7 @@ class Search:
         """The best of each state; seconds, iterations and `tried` are of all starts."""
         clearance = self.ocp.least(self.best.x).min(axis=1, initial=np.inf)
         return replace(self.best, clearance=clearance, seconds=self.seconds, iterations=self.iterations,
-                       tried=self._tried())
+                       tried=self._tried(), unit=np.full(len(self.x0), self.unit))
 
 
 def spread(ocp: OCP, x: Array) -> Array:
@@ -246,6 +248,7 @@ def _nearest(points: Array, scale: Array, images: list[Array], count: int) -> tu
     return np.take_along_axis(place, order, axis=1), order // count
 
 
-def _improved(former: Array, now: Array) -> NDArray[np.bool_]:
+def _improved(former: Array, now: Array, unit: float) -> NDArray[np.bool_]:
     finite = np.where(np.isfinite(former), former, 0.0)
-    return np.where(np.isfinite(former), now < finite - np.maximum(IMPROVED * np.abs(finite), TINY), np.isfinite(now))
+    least = np.maximum(IMPROVED * np.abs(finite), TINY * unit)
+    return np.where(np.isfinite(former), now < finite - least, np.isfinite(now))

@@ -28,6 +28,7 @@ from nocl.data import TINY
 from nocl.exports.bundle import export
 from nocl.judge import simulate
 from nocl.ocp import OCP
+from nocl.scales import usual_sizes
 from nocl.solvers import registry
 from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.settings import TrainSettings
@@ -272,7 +273,8 @@ def _verdict(ocp: OCP, arrays: dict[str, Any], judged: dict[str, Any], message: 
         clearance = f"; least clearance {clear.min():.3g}" if ocp.path_constraints else ""
         said.append(f"judged in open loop on the exact f, {count(len(rows), 'plan')}: mean cost {cost.mean():.4g}, "
                     f"predicted {arrays['cost'][rows].mean():.4g}{clearance}")
-        off = np.abs(cost - arrays["cost"][rows]) > COARSE * np.abs(arrays["cost"][rows]) + TINY
+        most = COARSE * np.abs(arrays["cost"][rows]) + TINY * usual_sizes(ocp).cost
+        off = np.abs(cost - arrays["cost"][rows]) > most
         if off.any():
             said.append(f"{off.sum()} of {len(rows)} differ by more than {100 * COARSE:g} %: the grid of "
                         f"{count(arrays['u'].shape[1], 'interval')} is too coarse there, or the plan is unstable in "

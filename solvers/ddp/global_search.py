@@ -251,12 +251,14 @@ def equilibria(ocp: OCP, draws: int, rng: np.random.Generator, dynamics: Any = N
     if s.xdot is None and dynamics is None:  # a plant that is not known: no other equilibria are
         return goal
     low, high = np.r_[s.lbx, s.lbu], np.r_[s.ubx, s.ubu]
-    of = ocp.functions.on(dynamics_function(ocp, dynamics))
+    of, half = ocp.functions.on(dynamics_function(ocp, dynamics)), (high - low) / 2
+    rate = half[:s.nx] / ocp.horizon  # what 1 stands for in f; half the box in z
 
     def linear(z: Array) -> tuple[Array, Array]:
         x, u = np.split(z.T, [s.nx])
         AB = (j.full().reshape(s.nx, len(z), -1) for j in of.jacobian.map(len(z))(x, u))
-        return of.f.map(len(z))(x, u).full().T, np.concatenate(list(AB), axis=2).transpose(1, 0, 2)
+        J = np.concatenate(list(AB), axis=2).transpose(1, 0, 2)
+        return of.f.map(len(z))(x, u).full().T / rate, J / rate[:, None] * half
 
     z = rng.uniform(low, high, (draws, len(low)))
     for _ in range(NEWTON):
@@ -264,7 +266,7 @@ def equilibria(ocp: OCP, draws: int, rng: np.random.Generator, dynamics: Any = N
             return goal
         value, J = linear(z)
         fine = np.isfinite(value).all(axis=1) & np.isfinite(J).all(axis=(1, 2))
-        z = z[fine] - np.einsum("bij,bj->bi", np.linalg.pinv(J[fine], rcond=1e-8), value[fine])
+        z = z[fine] - half * np.einsum("bij,bj->bi", np.linalg.pinv(J[fine], rcond=1e-8), value[fine])
     inside = (z >= low).all(axis=1) & (z <= high).all(axis=1)
     still = np.abs(linear(z)[0]).max(axis=1) < 1e-8 if len(z) else inside
     return np.vstack([goal, z[inside & still]])

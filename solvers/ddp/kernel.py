@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from nocl.functions import Stage
 from nocl.ocp import OCP
+from nocl.scales import units
 from nocl.support.checks import Array
 from nocl.translate.kernels import emit
 
@@ -47,7 +48,9 @@ def ddp_source(ocp: OCP, net: Any = None, substeps: int = 1) -> str:
              "NV": stage.v.numel(), "BEND": stage.bend.numel(), "NJ": stage.J.nnz(), "NW": stage.W.nnz(),
              "SUBSTEPS": substeps}
     lines = ['#include "lanes.h"', *(['#include "mlp.h"'] if nets else []),
-             *(f"#define {name} {value}" for name, value in sizes.items()), _STEP, _networks(at, nets),
+             *(f"#define {name} {value}" for name, value in sizes.items()),
+             f"static const double DAMPED[M] = {{{', '.join(map(repr, damped(ocp).tolist()))}}};", _STEP,
+             _networks(at, nets),
              emit("field", [*at.inputs, networks], [ca.densify(stage.rhs)]),
              emit("stage_jacobian", [*at.inputs, networks], [stage.J.T]),
              emit("network_weights", [*at.inputs, networks, stage.mu], [stage.v]),
@@ -57,6 +60,12 @@ def ddp_source(ocp: OCP, net: Any = None, substeps: int = 1) -> str:
     lines.append(emit("terminal", end.inputs, end.call(ocp.functions.G_derivatives)))
     lines.append('#include "ddp.h"\n')
     return "\n".join(lines)
+
+
+def damped(ocp: OCP) -> Array:
+    """What mu is multiplied by for each control, [nu]: 1 of Quu in the solver's units."""
+    of = units(ocp)
+    return of.cost / of.u**2
 
 
 class _Net:

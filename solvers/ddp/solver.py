@@ -29,6 +29,7 @@ from nocl.data import Solution
 from nocl.functions import Functions
 from nocl.ocp import OCP
 from nocl.sampling import own_numbers
+from nocl.scales import usual_sizes
 from nocl.solvers.ddp.batch import Job, Piece, Rows, assembled, pieces
 from nocl.solvers.ddp.kernel import ddp_source, pack_weights
 from nocl.solvers.ddp.without_compiler import ddp_kernel
@@ -43,6 +44,7 @@ from nocl.support.pool import Journal, Pool, stream
 if TYPE_CHECKING:
     from nocl.sysid.identification import LearnedDynamics
 
+ROUNDING = 1e-15  # of the usual cost
 STAGES = 4  # evaluations of f in an RK4 step
 TOLERATED = 0.01  # of a path constraint's scale: what the penalty may leave of a violation
 GROWTH, DECAY = 4.0, 2.0  # of mu, after a failure and a success: against 8 and 8, twice as many wild starts converge
@@ -53,9 +55,11 @@ class DDPSettings(Checked):
     """When to stop, and how steps are damped."""
 
     max_iterations: int = count(200, "of the descent")
-    tolerance: float = positive(1e-10, "stop when the predicted decrease of J is below tolerance * |J| + 1e-15")
+    tolerance: float = positive(1e-10, "stop when the predicted decrease of J is below tolerance * |J|, or 1e-15 of "
+                                "the usual cost")
     smallest_step: float = positive(2.0**-12, "of the line search", most=1)
-    damping: float = positive(1e-4, "first mu added to Quu where a sweep or a line search fails")
+    damping: float = positive(1e-4, "first mu added to Quu, in the solver's units, where a sweep or a line search "
+                              "fails")
     largest_damping: float = positive(1e8, "give up above it")
 
     def __post_init__(self) -> None:
@@ -255,6 +259,7 @@ class Work:
 
     def __post_init__(self) -> None:
         self.begin = time.perf_counter()
+        self.rounding = ROUNDING * usual_sizes(self.ddp.ocp).cost
         ocp, B, K = self.ddp.ocp, len(self.x0), self.ddp.intervals
         nx, nu = ocp.system.nx, ocp.system.nu
         self.h = (ocp.horizon - self.t0) / K
@@ -295,7 +300,7 @@ class Work:
             good, bad = rows[self.positive[rows] > 0], rows[self.positive[rows] == 0]
             self.refused[bad] = np.maximum(self.refused[bad], self.mu[bad])
             self._damp(bad)
-            small = -(self.slope[good] + self.curve[good]) <= s.tolerance * np.abs(self.J[good]) + 1e-15
+            small = -(self.slope[good] + self.curve[good]) <= s.tolerance * np.abs(self.J[good]) + self.rounding
             self._settle(good[small])
             self._line_search(good[~small])
 

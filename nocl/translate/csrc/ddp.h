@@ -288,7 +288,7 @@ static void value_update(lane Q[NZ][NZ], const lane *q, const lane *k, lane gain
     }
 }
 
-/* The Riccati sweep about (x, u). Writes k, gain, slope = sum k'q, curve = sum k'Q k / 2, whether every Quu + mu I was
+/* The Riccati sweep about (x, u). Writes k, gain, slope = sum k'q, curve = sum k'Q k / 2, whether every Quu + mu D was
    positive, and, where asked for (not NULL), V [B, K+1], V_x [B, K+1, N], V_xx [B, K+1, N, N]. */
 void nocl_backward(int64_t first, int64_t last, const int64_t *index, int64_t K, const double *weights,
                    const double *lb, const double *ub, const double *h_, const double *x_, const double *u_,
@@ -313,7 +313,7 @@ void nocl_backward(int64_t first, int64_t last, const int64_t *index, int64_t K,
             for (int j = 0; j < M; ++j) u[j] = gather(u_, at, K * M, (t - 1) * M + j);
             V[0] += interval(weights, x, u, h, Vx, Vxx, Q, q);
             for (int i = 0; i < M; ++i)
-                for (int j = 0; j < M; ++j) Quu[i][j] = Q[N + i][N + j] + (i == j ? reg : (lane){0});
+                for (int j = 0; j < M; ++j) Quu[i][j] = Q[N + i][N + j] + (i == j ? reg * DAMPED[i] : (lane){0});
             positive &= boxed_newton(Quu, q + N, u, lb, ub, held, k, L);
             feedback(L, Q, held, gain);
             for (int j = 0; j < M; ++j) {
