@@ -111,6 +111,21 @@ def test_threads_get_their_own_answers():
     assert len(guard._COPIES) == 1  # those of the threads went with them
 
 
+def test_a_copy_that_inherits_a_locked_lock_is_made_anew():
+    """As a fork beside threads may, which catches one of them inside a library."""
+    lock = threading.Lock()
+
+    def locked(x):
+        with lock:
+            return 2 * x
+
+    lock.acquire()
+    timer = threading.Timer(0.3, lock.release)
+    timer.start()
+    assert Guarded(locked, lambda: locked(0))(60.0, 21) == 42
+    timer.join()
+
+
 @pytest.fixture
 def stuck_from(monkeypatch):
     """NMPC's fatrop sleeps where the guess begins beyond `limit` in the first state."""

@@ -251,7 +251,12 @@ class Transcription:
     @cached_property
     def _guarded(self) -> Guarded:
         self.solver  # noqa: B018 - built here, the copies have it
-        return Guarded(self._solve)
+        return Guarded(self._solve, self._rehearse)
+
+    def _rehearse(self) -> None:
+        for name in self.solver.get_function():
+            _at_zero(self.solver.get_function(name))
+        self.split(ca.DM.zeros(self.solver.sparsity_in(0)))
 
     @cached_property
     def _evaluation(self) -> float:
@@ -262,7 +267,7 @@ class Transcription:
         hessian, took = self.solver.get_function(name), list[float]()
         for _ in range(TIMED):
             begin = time.perf_counter()
-            hessian(*(ca.DM.zeros(hessian.sparsity_in(i)) for i in range(hessian.n_in())))
+            _at_zero(hessian)
             took.append(time.perf_counter() - begin)
         return min(took)
 
@@ -326,6 +331,10 @@ class Transcription:
             i = int(np.flatnonzero(path == row)[0])
             node, what = 1 + i // self.n_path, f"path constraint {list(self.ocp.path_constraints)[i % self.n_path]!r}"
         return float(excess[row]), f"{excess[row] * self.scales.g[row]:.3g} of {what} at node {node}, t = {t[node]:.4g}"
+
+
+def _at_zero(function: ca.Function) -> None:
+    function(*(ca.DM.zeros(function.sparsity_in(i)) for i in range(function.n_in())))
 
 
 def outcome_of(stats: dict[str, Any], limited: bool = False) -> str:
