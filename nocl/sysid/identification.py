@@ -158,8 +158,9 @@ class LearnedDynamics:
             system = System.from_data(record.card["system"])
             parts = _structure_from(record.card["parts"], record.functions, box_of(system))
             coverage = record.card.get("coverage")
-            return LearnedDynamics(system, record.nets["f"].eval(), record.card["structure"], record.card["card"], parts,
-                                   None if coverage is None else Coverage.from_data(coverage))
+            seen = None if coverage is None else Coverage.from_data(coverage)
+            return LearnedDynamics(system, record.nets["f"].eval(), record.card["structure"], record.card["card"],
+                                   parts, seen)
 
     def __repr__(self) -> str:
         nets = [net for net in self.net.nets if isinstance(net, MLP)]
