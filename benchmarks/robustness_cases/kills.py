@@ -37,7 +37,7 @@ def said(*arrays):
     print(sha256(*(np.ascontiguousarray(a).tobytes() for a in arrays)))
 """
 RUNS = {
-    "NMPC": (14, "s = NMPC(ocp, 20, starts=4, passes=1).solve(x0, out=out / 'run', workers=1, progress=False)\n"
+    "NMPC": (12, "s = NMPC(ocp, 20, starts=4, passes=1).solve(x0, out=out / 'run', workers=1, progress=False)\n"
                  "said(s.cost, s.u)"),
     "NMPC in processes": (6, "s = NMPC(ocp, 20, starts=4, passes=1).solve(x0, out=out / 'run', workers=2, "
                              "progress=False)\nsaid(s.cost, s.u)"),
