@@ -119,8 +119,9 @@ def test_the_same_equations_written_otherwise_are_the_same_system(pendulum):
 
 
 MODELS = {"no card": lambda s: s.pop("card"), "no net": lambda s: s["nets"].clear(),
-          "a list": lambda s: s.update(card=[]), "no structure": lambda s: s["card"].pop("structure"), "a wrong part": lambda s: s["card"].update(parts=3),
-          "no functions": lambda s: s["functions"].pop("linear"), "a number": lambda s: s["card"].update(system=1)}
+          "a list": lambda s: s.update(card=[]), "no structure": lambda s: s["card"].pop("structure"),
+          "a wrong part": lambda s: s["card"].update(parts=3), "no functions": lambda s: s["functions"].pop("linear"),
+          "a number": lambda s: s["card"].update(system=1)}
 
 
 @pytest.fixture(scope="module")
