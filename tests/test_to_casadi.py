@@ -183,7 +183,7 @@ def with_nan() -> nn.Module:
     (nn.Linear(2, 1), {"n_in": 0}, "n_in is 0"),
     (nn.Tanh(), {}, "pass n_in"),
     (nn.LayerNorm((2, 3)), {}, "expected one dimension"),
-    (MLP([2, 1]), {"backend": "onnx"}, "expected one of native, l4casadi"),
+    (MLP([2, 1]), {"backend": "onnx"}, "expected 'native' or 'l4casadi'"),
     (MLP([2, 1]), {"build_dir": "x"}, "leave it out"),
     (MLP([2, 1]), {"in_names": ["x", "t"]}, "in_names has 2 names"),
     (MLP([2, 1]), {"name": "not a name"}, "expected plain identifiers"),

@@ -9,7 +9,10 @@ from __future__ import annotations
 import io
 import json
 import logging
+import os
 import pickle
+import signal
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -104,7 +107,7 @@ def _in_processes(k: int, job: Any, tasks: Sequence[Task]) -> Iterator[Outcome]:
 
     data = pickle.dumps(job)
     work = Parallel(n_jobs=k, backend="loky", batch_size=1, pre_dispatch="2*n_jobs", return_as="generator_unordered")
-    for outcomes in work(delayed(_work)(data, chunk) for chunk in _chunks(tasks)):
+    for outcomes in work(delayed(_work)(data, chunk, os.getpid()) for chunk in _chunks(tasks)):
         yield from outcomes
 
 
@@ -191,7 +194,20 @@ def _job(data: bytes) -> Any:
     return pickle.loads(data)
 
 
-def _work(data: bytes, tasks: Sequence[Task]) -> list[Outcome]:
+@lru_cache(maxsize=1)
+def _end_with(parent: int) -> None:
+    """Ends this worker once its parent is gone: where that was killed, joblib's workers wait on for minutes."""
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(LOOK)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _work(data: bytes, tasks: Sequence[Task], parent: int | None = None) -> list[Outcome]:
+    if parent is not None:
+        _end_with(parent)
     return [_job(data)(task) for task in tasks]
 
 

@@ -61,8 +61,10 @@ def reading(path: str | os.PathLike[str], what: str) -> Iterator[None]:
         said = str(error).strip().partition("\n")[0]  # CasADi lists all its overloads
         if isinstance(error, ValueError) and str(path) in said:
             raise
-        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
-        raise ValueError(f"{path}: {kind}{said}; expected {what} that nocl wrote: save it again") from error
+        kind = "" if isinstance(error, (KeyError, ValueError)) else f"{type(error).__name__}: "
+        said += " is missing" if isinstance(error, KeyError) else ""
+        raise ValueError(f"{path}: {kind}{said}, in its structure; expected {what} that nocl wrote: save it again"
+                         ) from error
 
 
 def write_json(path: str | Path, data: Any) -> Path:
