@@ -99,7 +99,7 @@ class LearnedDynamics:
     def validate(self, log: Log, steps: Sequence[int] = HORIZONS, *, every: int | None = None) -> Validation:
         """Errors of simulations of f_theta from a log's states, by number of steps: see nocl.sysid.logs.validation."""
         log.check(self.system)
-        return validate(self.net, log, steps, every, int(self.card.get("settings", {}).get("substeps", 1)))
+        return validate(self.net, log, steps, every, int(self.card.get("substeps", 1)))
 
     def outside(self, x: ArrayLike, what: str | None = None) -> Any:
         """Which states [N, nx] the model was not taught about, [N] bool; a UserWarning names `what`, where given.
@@ -158,9 +158,9 @@ class LearnedDynamics:
             system = System.from_data(record.card["system"])
             parts = _structure_from(record.card["parts"], record.functions, box_of(system))
             coverage = record.card.get("coverage")
-            seen = None if coverage is None else Coverage.from_data(coverage)
-            return LearnedDynamics(system, record.nets["f"].eval(), record.card["structure"], record.card["card"],
-                                   parts, seen)
+            card = record.card["card"]
+            return LearnedDynamics(system, record.nets["f"].eval(), record.card["structure"], card, parts,
+                                   None if coverage is None else Coverage.from_data(coverage))
 
     def __repr__(self) -> str:
         nets = [net for net in self.net.nets if isinstance(net, MLP)]
@@ -251,12 +251,13 @@ def _from_log(system: System, log: Log, stated: Stated, settings: LogSettings, s
     start = time.perf_counter()
     parts = stated.plain(data_box(system, np.vstack([np.hstack([s, r.u]) for s, r in first_states(log)])))
     said = contradictions_of(log, stated.z, stated.rows)
-    net, stages = fit_log(log, parts, settings, seed, bar)
-    seen = validate(net, log, (1, min(settings.window, max(map(len, log)) - 1)), substeps=settings.substeps)
+    net, stages, substeps = fit_log(log, parts, settings, seed, bar)
+    seen = validate(net, log, (1, min(settings.window, max(map(len, log)) - 1)), substeps=substeps)
     _warn_of(said, "log speaks", 5)
     _warn_of_no_progress(stages, seen)
     errors = ", ".join(f"{100 * e:.3g} % after {k}" for k, e in zip(seen.steps, seen.relative, strict=True))
     card = {"method": "log", "gradients": False, "seed": seed, "settings": asdict(settings), "labels": len(log),
+            "substeps": substeps,
             "seconds": round(time.perf_counter() - start, 3), "torch": torch.__version__,
             "windows": [asdict(stage) for stage in stages], "contradictions": said,
             "score": f"simulation error on its own log, in units of the states' spread: {errors} steps"}
