@@ -249,7 +249,7 @@ class OCP:
         """The least value [B, number of them] of each path constraint along states x [B, n, nx]; inf for NaN."""
         n = self.system.nx
         x = checks.numeric(x, "x", "OCP.least", f"states [B, n, {n}]")
-        if x.ndim != 3 or x.shape[2] != n or not x.size:
+        if x.ndim != 3 or x.shape[2] != n or not x.shape[1]:
             raise ValueError(f"OCP.least: x has shape {x.shape}; expected [B, n, {n}]")
         if not self.path_constraints:
             return np.full((len(x), 0), np.inf)

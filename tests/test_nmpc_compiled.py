@@ -62,5 +62,5 @@ def test_failures_of_compiled_programs_are_told(tmp_path):
 
 @pytest.mark.parametrize("compiled", [None, 3, ""])
 def test_bad_compiled(compiled):
-    with pytest.raises(ValueError, match="compiled is"):
+    with pytest.raises(ValueError, match=r"compiled \(True, False, or a folder\) is"):
         NMPC(nocl.load_ocp("double_integrator"), 6, compiled=compiled)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import glob
-import hashlib
 import os
 import platform
 import re
@@ -11,7 +10,9 @@ import shutil
 import uuid
 from pathlib import Path
 
-HOST = hashlib.sha256(platform.node().encode()).hexdigest()[:12]
+from nocl.support.fingerprint import sha256
+
+HOST = sha256(platform.node())[:12]
 PART = re.compile(r"\.(?P<name>.+)\.(?P<host>[0-9a-f]{12})-(?P<pid>\d+)-[0-9a-f]{32}\.part")
 
 

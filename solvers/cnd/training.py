@@ -103,7 +103,7 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
 
 def _check(ocp: OCP, dynamics: LearnedDynamics | None, seed: int, out: str | os.PathLike[str] | None) -> None:
     checks.instance(OCP, ocp, "ocp", "train", "nocl.load_ocp(name)")
-    checks.whole(seed, "seed", "train", most=2**62)
+    checks.whole(seed, "seed", "train", most=2**62 - 1)
     if out is not None and Path(out).exists() and not Path(out).is_dir():
         raise ValueError(f"train: out is the file {out}; expected a folder for checkpoints")
     if dynamics is not None and not hasattr(dynamics, "system"):
