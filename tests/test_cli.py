@@ -372,6 +372,7 @@ def test_a_run_from_a_users_file_to_its_report(here, capsys, monkeypatch):
     assert "parity ok: policy" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_controller_that_no_run_made_is_not_overwritten(here, capsys, monkeypatch):
     small(monkeypatch)
     ocp = nocl.load_ocp("cubic.py")

@@ -89,6 +89,7 @@ def test_one_state_one_control_and_one_interval():
         assert np.abs(s.V_xx[0] - 2 * S).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_ten_thousand_intervals():
     S, *_ = riccati(np.array([[0, 1], [0, 0.0]]), np.array([[0.0], [1.0]]), 0.01 * np.eye(1), np.eye(2), 2.0, 10_000)
     s = solver("double_integrator", 10_000).solve([1.0, 0.0])

@@ -141,6 +141,7 @@ def test_the_problems_that_come_with_nocl_need_one_step(name):
     assert WANTED < FINE < COARSE
 
 
+@pytest.mark.slow
 def test_a_log_whose_samples_are_far_apart_is_fitted_by_shorter_steps():
     """The actuator settles in 33 ms, a sample comes every 50 ms: one Runge-Kutta step is 6 % off."""
     s, h, K = lag(30.0).system, 0.05, 40
