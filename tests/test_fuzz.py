@@ -6,7 +6,7 @@ import warnings
 from dataclasses import fields
 from functools import cache, partial
 from pathlib import Path
-from tempfile import mkdtemp
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import casadi as ca
@@ -73,8 +73,13 @@ def ocp() -> nocl.OCP:
 
 
 @cache
+def temporary() -> TemporaryDirectory[str]:
+    return TemporaryDirectory()
+
+
+@cache
 def folder() -> Path:
-    return Path(mkdtemp(prefix="nocl-fuzz-"))
+    return Path(temporary().name)
 
 
 @cache
