@@ -51,7 +51,8 @@ def tried(cases: list[Case]) -> dict[str, object]:
         elif why:
             wrong[name] = why[:300]
             print(f"  {name}: {why[:300]}", flush=True)
-    return {"tried": len(cases) - left_out, "left out": left_out, "wrong": len(wrong), "which": wrong, "seconds": round(time.perf_counter() - begin, 1)}
+    return {"tried": len(cases) - left_out, "left out": left_out, "wrong": len(wrong), "which": wrong,
+            "seconds": round(time.perf_counter() - begin, 1)}
 
 
 def main() -> None:
