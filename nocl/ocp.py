@@ -183,6 +183,8 @@ class OCP:
             for i in self.periodic:
                 rows[..., i] -= 2 * np.pi * np.round(rows[..., i] / (2 * np.pi))
             return rows
+        if x.shape != (self.system.nx, 1):
+            raise ValueError(f"from_goal: x has shape {x.shape}; expected a column ({self.system.nx}, 1)")
         d: Any = x - ca.DM(self.x_goal)
         for i in self.periodic:
             d[i] = ca.remainder(d[i], 2 * np.pi)

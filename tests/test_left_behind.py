@@ -12,7 +12,7 @@ import pytest
 
 import nocl
 from nocl.solvers import NMPC
-from nocl.support import atomic, pool
+from nocl.support import atomic, compiler, pool
 from nocl.support.atomic import part_of, remove_parts, write_bytes
 
 WORKER = """
@@ -71,6 +71,18 @@ def test_a_worker_ends_with_the_process_that_it_works_for():
             return
         time.sleep(0.1)
     pytest.fail("the worker lives on")
+
+
+def test_folders_for_libraries_go_with_their_process(tmp_path, monkeypatch):
+    """Also where it was killed before its lock was there, or after that was gone."""
+    monkeypatch.setattr(compiler.tempfile, "tempdir", str(tmp_path))
+    left, lives, older = (tmp_path / f"{compiler.OWN}{name}" for name in (
+        f"{atomic.HOST}-{dead()}-abc", f"{atomic.HOST}-{os.getpid()}-abc", "abc"))
+    for folder in (left, lives, older):
+        folder.mkdir()
+        (folder / "library.so").write_text("")
+    compiler.remove_left()
+    assert set(tmp_path.iterdir()) == {lives, older}
 
 
 @pytest.fixture(scope="module")

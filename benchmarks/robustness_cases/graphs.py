@@ -18,6 +18,8 @@ from onnx import TensorProto, helper
 
 from nocl.exports.onnx_reader import RULES
 
+from . import NOTHING
+
 CHAINS, LONGEST = 60, 7
 UNARY = ("Abs", "Neg", "Tanh", "Sigmoid", "Relu", "Elu", "Selu", "Celu", "Softplus", "Softsign", "HardSigmoid",
          "HardSwish", "Floor", "Ceil", "Round", "Sign", "Sin", "Cos", "Erf", "LeakyRelu", "Identity", "Exp")
@@ -30,7 +32,7 @@ def operation(op: str, version: int, kind: str, seed: int, path: Path) -> str:
         graph.add(op, single.typed(args, kind, single.TYPES[kind][-1]), options)
     model = graph.model(version)
     expected = single.runtime(model, graph.rows)
-    return "" if expected is None else compared(path, model, expected, graph.rows, op == "Gelu")
+    return NOTHING if expected is None else compared(path, model, expected, graph.rows, op == "Gelu")
 
 
 def compared(path: Path, model: Any, expected: list[Any], rows: list[Any], loose: bool = False) -> str:
@@ -56,7 +58,7 @@ def chain(rng: np.random.Generator, path: Path) -> str:
     graph.outputs = [names[-1]]
     model = graph.model(20)
     expected = single.runtime(model, graph.rows)
-    return "" if expected is None else compared(path, model, expected, graph.rows)
+    return NOTHING if expected is None else compared(path, model, expected, graph.rows)
 
 
 def node(rng: np.random.Generator, graph: Any, a: str, b: str, out: str, n: int) -> Any:

@@ -12,7 +12,8 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -108,28 +109,41 @@ def processes(session: int) -> list[int]:
     return found
 
 
-def killed(code: str, place: Path, after: float, right: str) -> str:
-    process = started(code, place)
-    try:
-        process.wait(timeout=after)
-    except subprocess.TimeoutExpired:
-        os.kill(process.pid, signal.SIGKILL)
-        process.wait()
-    again = whole(code, place)
-    rest = left(place, process.pid)
-    if again != right:
-        return f"killed after {after:.2f} s: another answer"
-    return f"killed after {after:.2f} s: left {rest}" if rest else ""
+@dataclass(frozen=True, eq=False)
+class Run:
+    """A run, and what it says and takes when nobody kills it; that is found out when it is first asked for."""
+
+    code: str
+    place: Path
+
+    @cached_property
+    def right(self) -> str:
+        return whole(self.code, self.place / "whole")
+
+    @cached_property
+    def usual(self) -> float:
+        """Seconds, once everything has been read from the disk before."""
+        right, begin = self.right, time.perf_counter()
+        if whole(self.code, self.place / "again") != right:
+            raise ValueError("two runs that nobody killed differ")
+        return time.perf_counter() - begin
+
+    def killed(self, number: int, part: float) -> str:
+        after, place = part * self.usual, self.place / str(number)
+        process = started(self.code, place)
+        try:
+            process.wait(timeout=after)
+        except subprocess.TimeoutExpired:
+            os.kill(process.pid, signal.SIGKILL)
+            process.wait()
+        again = whole(self.code, place)
+        rest = left(place, process.pid)
+        if again != self.right:
+            return f"killed after {after:.2f} s: another answer"
+        return f"killed after {after:.2f} s: left {rest}" if rest else ""
 
 
 def kinds(rng: np.random.Generator, folder: Path) -> Iterator[tuple[str, list[Case]]]:
     for kind, (n, lines) in RUNS.items():
-        code, place = script(lines), folder / kind.replace(" ", "-")
-        right = whole(code, place / "whole")
-        begin = time.perf_counter()
-        if whole(code, place / "again") != right:
-            raise ValueError(f"{kind}: two runs that nobody killed differ")
-        usual = time.perf_counter() - begin
-        moments = usual * rng.uniform(EARLIEST, 1.0, n)
-        yield kind, [(f"kill {i}", partial(killed, code, place / str(i), float(after), right))
-                     for i, after in enumerate(moments)]
+        run, parts = Run(script(lines), folder / kind.replace(" ", "-")), rng.uniform(EARLIEST, 1.0, n)
+        yield kind, [(f"kill {i}", partial(run.killed, i, float(part))) for i, part in enumerate(parts)]

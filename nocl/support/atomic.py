@@ -25,11 +25,12 @@ def remove_parts(folder: Path, name: str = "") -> None:
     """Removes the parts (of one name) that processes of this machine were killed over."""
     for path in folder.glob(f".{glob.escape(name)}*.part"):
         found = PART.fullmatch(path.name)
-        if found and found["host"] == HOST and name in ("", found["name"]) and not _lives(int(found["pid"])):
+        if found and found["host"] == HOST and name in ("", found["name"]) and not lives(int(found["pid"])):
             shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
 
 
-def _lives(process: int) -> bool:
+def lives(process: int) -> bool:
+    """Whether there is a process of that number on this machine."""
     try:
         os.kill(process, 0)
     except ProcessLookupError:
