@@ -29,7 +29,7 @@ class Sizes:
 @lru_cache(maxsize=32)
 def usual_sizes(ocp: OCP) -> Sizes:
     s, rng = ocp.system, own_numbers(0)
-    x = ocp.initial_states.sample(SAMPLES, rng)
+    x = np.clip(ocp.initial_states.sample(SAMPLES, rng), s.lbx, s.ubx)  # far outside X costs are not usual
     u = rng.uniform(s.lbu, s.ubu, (SAMPLES, s.nu))
     J = np.abs(ocp.horizon * ocp.L(x.T, u.T).full()) + np.abs(ocp.G(x.T).full())
     J = J[np.isfinite(J) & (J > 0)]

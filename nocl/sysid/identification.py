@@ -99,7 +99,8 @@ class LearnedDynamics:
     def validate(self, log: Log, steps: Sequence[int] = HORIZONS, *, every: int | None = None) -> Validation:
         """Errors of simulations of f_theta from a log's states, by number of steps: see nocl.sysid.logs.validation."""
         log.check(self.system)
-        return validate(self.net, log, steps, every, int(self.card.get("substeps", 1)))
+        settings = self.card.get("settings", {})  # where cards had them before
+        return validate(self.net, log, steps, every, int(self.card.get("substeps", settings.get("substeps", 1))))
 
     def outside(self, x: ArrayLike, what: str | None = None) -> Any:
         """Which states [N, nx] the model was not taught about, [N] bool; a UserWarning names `what`, where given.
