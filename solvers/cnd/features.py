@@ -15,6 +15,7 @@ import numpy as np
 
 from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
+from nocl.scales import usual_sizes
 from nocl.support.checks import Array
 from nocl.translate.arguments import Arguments
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from nocl.solvers.cnd.labels import Labels
 
 DEGREE = 6  # of the polynomials in time
+CONSTANT = 1e-6  # of its usual size: what varies less is as good as constant
 LEAST_TIME = 0.025  # of the horizon: time to go is never counted as less
 
 
@@ -37,7 +39,8 @@ def features(ocp: OCP, x: Array, t: Array, dt: Array | None = None, *, plain: bo
     state, time = at["x"], at["t"] if dt is None else at["t"] + at["dt"] / 2
     tau = 2 * time / ocp.horizon - 1
     to_go = ca.fmax(ocp.horizon - time, 0)
-    mean, spread = _moments_in_time(x, 2 * (t if dt is None else t + dt / 2) / ocp.horizon - 1)
+    half = usual_sizes(ocp).x
+    mean, spread = _moments_in_time(x, 2 * (t if dt is None else t + dt / 2) / ocp.horizon - 1, half)
     standard = (state - _polynomial(mean, tau)) / ca.exp(_polynomial(spread, tau))
     once = [i for i in range(s.nx) if i not in ocp.periodic]  # the others have many images: sines and cosines only
     angles = [g(state[i]) for i in s.angle_indices for g in (ca.sin, ca.cos)]
@@ -50,16 +53,22 @@ def features(ocp: OCP, x: Array, t: Array, dt: Array | None = None, *, plain: bo
     given = [x, t] if dt is None else [x, t, dt]
     some = slice(None, None, -(-len(t) // 20_000))  # of every kind of label
     values = at.function("raw", {"raw": raw})(*(np.atleast_2d(a[some].T) for a in given)).full()
-    centre, width = values.mean(axis=1), values.std(axis=1) + 1e-6
+    rates = [1.0 if i in ocp.periodic else half[i] for i in range(s.nx)]
+    one = np.r_[np.ones(len(once) + len(angles) + clock.numel()), rates, half[once] if plain else [],
+                [] if dt is None else [ocp.horizon]]
+    centre, width = values.mean(axis=1), values.std(axis=1) + CONSTANT * one
     return at.function("features", {"phi": (raw - ca.DM(centre)) / ca.DM(width)})
 
 
-def _moments_in_time(x: Array, tau: Array) -> tuple[Array, Array]:
-    """Chebyshev coefficients [nx, DEGREE+1] of the mean and of the log standard deviation of x at tau in [-1, 1]."""
+def _moments_in_time(x: Array, tau: Array, half: Array) -> tuple[Array, Array]:
+    """Chebyshev coefficients [nx, DEGREE+1] of the mean and of the log standard deviation of x at tau in [-1, 1].
+
+    half : usual sizes of x [nx]
+    """
     bins = np.clip(((tau + 1) * 10).astype(int), 0, 19)
     filled = [bins == b for b in range(20) if (bins == b).sum() > 8] or [bins >= 0]
     centres, groups = [tau[b].mean() for b in filled], [x[b] for b in filled]
-    floor = 0.05 * x.std(axis=0) + 1e-6
+    floor = 0.05 * x.std(axis=0) + CONSTANT * half
     degree = min(DEGREE, max(len(centres) - 1, 0))
     mean = np.polynomial.chebyshev.chebfit(centres, [g.mean(axis=0) for g in groups], degree)
     spread = np.polynomial.chebyshev.chebfit(centres, [np.log(g.std(axis=0) + floor) for g in groups], degree)
@@ -81,7 +90,7 @@ def policy_net(ocp: OCP, labels: Labels, sizes: tuple[int, ...],
     """
     s = ocp.system
     phi = features(ocp, labels.x, labels.t, labels.dt if control_dt else None)
-    mean, spread = ca.DM(labels.u.mean(axis=0)), ca.DM(labels.u.std(axis=0) + 1e-9)
+    mean, spread = ca.DM(labels.u.mean(axis=0)), ca.DM(labels.u.std(axis=0) + 1e-9 * usual_sizes(ocp).u)
     y, u = ca.SX.sym("y", s.nu), ca.SX.sym("u", s.nu)
     clipped = ca.fmin(ca.fmax(mean + spread * y, ca.DM(s.lbu)), ca.DM(s.ubu))
     outputs = Arguments.of(phi).function("controls", {"u": clipped}, y=y)
