@@ -14,10 +14,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from nocl.comparisons.report.findings import MethodAudit, Rollouts, ValueAudit
+from nocl.comparisons.report.findings import MethodAudit, Rollouts, ValueAudit, per_cent
 from nocl.comparisons.report.report import Report
 from nocl.comparisons.report.results import (
-    COST_FLOOR,
     REFERENCE,
     Judged,
 )
@@ -67,7 +66,7 @@ def _excess(judged: Judged, cost: Array | None) -> Array:
     if cost is None:
         return np.full(len(J), np.nan)
     with np.errstate(invalid="ignore"):
-        excess = 100 * (J - cost) / np.maximum(np.abs(J), COST_FLOOR)
+        excess = per_cent(J - cost, J)
     return np.where(np.isfinite(J), excess, np.where(np.isfinite(cost), np.inf, np.nan))
 
 

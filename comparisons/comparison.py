@@ -25,6 +25,7 @@ from nocl.comparisons.report.results import (
 from nocl.ocp import OCP
 from nocl.support import checks
 from nocl.support.checks import Array
+from nocl.support.pool import Pool
 
 
 def compare(ocp: OCP, methods: Mapping[str, Any], n: int = 100, x0: ArrayLike | None = None, seed: int = 1,
@@ -50,6 +51,8 @@ def compare(ocp: OCP, methods: Mapping[str, Any], n: int = 100, x0: ArrayLike | 
     """
     checks.problem(ocp, "compare")
     ocp.refuse_parameters("compare")
+    checks.whole(seed, "seed", "compare", most=2**63)
+    Pool(workers)  # refuses what is none before anything is solved
     states = initial_states(ocp, n, x0, seed)
     rates, folder = rates_of(hold), None if out is None else Path(out)
     start = time.perf_counter()
@@ -67,7 +70,7 @@ def initial_states(ocp: OCP, n: int, x0: ArrayLike | None, seed: int) -> Array:
     """The states [B, nx] that are meant."""
     if x0 is None:
         if not is_count(n):
-            raise ValueError(f"n is {n!r}; expected a number of initial states >= 1")
+            raise ValueError(f"n is {checks.shown(n)}; expected a number of initial states >= 1")
         return ocp.initial_states.sample(int(n), seed)
     rows = checks.states(x0, ocp.system.nx, ocp.system.name)[0].copy()
     if not len(rows):

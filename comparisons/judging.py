@@ -15,7 +15,7 @@ import cloudpickle
 import numpy as np
 from numpy.typing import NDArray
 
-from nocl.comparisons.methods import STAGES, MethodRun, said
+from nocl.comparisons.methods import STAGES, MethodRun, said, substeps_of
 from nocl.judge import Simulation, simulate
 from nocl.ocp import OCP
 from nocl.solvers.nmpc.loop import Loop
@@ -208,8 +208,8 @@ def _of_loop(loop: Loop) -> tuple[Array, Array, Array]:
     """(ms of the first solve, the median of the later ones, evaluations of f by all), from the loop's last run."""
     ms = 1e3 * np.array([step["seconds"] for step in loop.stats])
     iterations = np.sum([step["iterations"] for step in loop.stats], axis=0)
-    nmpc = loop.nmpc
-    return ms[0], np.median(ms[1:] if len(ms) > 1 else ms, axis=0), iterations * nmpc.intervals * STAGES * nmpc.substeps
+    evaluations = iterations * loop.nmpc.intervals * STAGES * substeps_of(loop.nmpc)
+    return ms[0], np.median(ms[1:] if len(ms) > 1 else ms, axis=0), evaluations
 
 
 def _milliseconds(controller: Any, x: Array) -> tuple[float, float]:

@@ -22,11 +22,13 @@ from nocl.comparisons.report.results import Planned, count
 from nocl.data import Solution
 from nocl.judge import check_made_for, policy_function
 from nocl.ocp import OCP
+from nocl.scales import usual_sizes
 from nocl.solvers.nmpc.loop import Loop
-from nocl.support.checks import Array
+from nocl.support.checks import LARGEST, Array, shown
 
 SAMPLED = 80  # intervals that a plain callable is held on
 STAGES = 4  # evaluations of f in an RK4 step
+SAME_STATE = 1e-6  # of usual sizes: closer states are the same
 Rates = tuple[int | None, ...]
 
 
@@ -84,7 +86,7 @@ class Solving:
 def checked(methods: Mapping[str, Any]) -> Mapping[str, Any]:
     """Methods by name, or ValueError."""
     if not isinstance(methods, Mapping) or not methods:
-        raise ValueError(f"methods is {type(methods).__name__} {methods!r}; expected a dict of methods by name, "
+        raise ValueError(f"methods is {type(methods).__name__} {shown(methods)}; expected a dict of methods by name, "
                          'like {"CND": cnd, "NMPC": nmpc}')
     for name in methods:
         if not isinstance(name, str) or not name.strip() or not name.isprintable():
@@ -97,13 +99,13 @@ def rates_of(hold: int | Sequence[int | None] | None) -> Rates:
     given = (None,) if hold is None else (None, hold) if isinstance(hold, (int, np.integer)) else hold
     if isinstance(given, str) or not isinstance(given, Sequence) or not given or \
             not all(rate is None or is_count(rate) for rate in given):
-        raise ValueError(f"hold is {hold!r}; expected a number of intervals >= 1, None for continuous feedback, or a "
-                         "list of these")
+        raise ValueError(f"hold is {shown(hold)}; expected a number of intervals >= 1, None for continuous "
+                         "feedback, or a list of these")
     return tuple(dict.fromkeys(None if rate is None else int(rate) for rate in given))
 
 
 def is_count(value: Any) -> bool:
-    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and bool(value >= 1)
+    return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and 1 <= int(value) <= LARGEST
 
 
 def runs_of(ocp: OCP, methods: Mapping[str, Any], x0: Array, rates: Rates, solving: Solving) -> list[MethodRun]:
@@ -190,7 +192,8 @@ def _check_solution(ocp: OCP, name: str, solution: Solution, x0: Array) -> None:
     if solution.u.ndim != 3 or len(solution.u) != B or solution.u.shape[2] != ocp.system.nu:
         raise ValueError(f"method {name!r} is a Solution with controls {solution.u.shape}; expected [{B}, K, "
                          f"{ocp.system.nu}], one solution for each of the {B} initial states: pass its x0 to compare")
-    same = np.isclose(solution.x[:, 0], x0, rtol=1e-6, atol=1e-6).all(axis=1)
+    size = np.abs(x0) + usual_sizes(ocp).x
+    same = (np.abs(solution.x[:, 0] - x0) <= SAME_STATE * size).all(axis=1)
     away = np.flatnonzero(np.asarray(solution.success, dtype=bool) & ~same)
     if away.size:
         raise ValueError(f"method {name!r} solves state {away[0]} from {solution.x[away[0], 0].tolist()}, but the "
@@ -241,12 +244,17 @@ def planned(ocp: OCP, name: str, method: Any, parts: Sequence[Solution | str], B
         u[rows], predicted[rows], plan.x[rows] = s.u, s.cost, s.x
         plan.costate[rows] = s.costate
         ms[rows] = 1e3 * s.seconds
-        evaluations[rows] = s.iterations * K * STAGES * getattr(method, "substeps", 1)
+        evaluations[rows] = s.iterations * K * STAGES * substeps_of(method)
         solves[rows] = np.maximum(s.starts, 1)
         message += _unsolved(ocp, s)
     u[[bool(m) for m in message]] = np.nan
     solved = Solved(ms, solves, predicted, evaluations, plan, message)
     return MethodRun(name, f"open loop, held on {count(K, 'interval')}", method, u, solved=solved)
+
+
+def substeps_of(solver: Any) -> int:
+    """Runge-Kutta steps in each of its intervals."""
+    return int(getattr(getattr(solver, "settled", solver), "substeps", 1))
 
 
 def _unsolved(ocp: OCP, solution: Solution) -> list[str]:

@@ -10,11 +10,12 @@ from tqdm import tqdm
 
 from nocl.comparisons.promise import interval
 from nocl.comparisons.reference import Reference
-from nocl.comparisons.report.findings import Region
-from nocl.comparisons.report.results import COST_FLOOR, VIOLATION
+from nocl.comparisons.report.findings import Region, per_cent
+from nocl.comparisons.report.results import VIOLATION
 from nocl.judge import simulate
 from nocl.ocp import OCP
 from nocl.sampling import Distribution, Gaussian, Uniform
+from nocl.scales import usual_sizes
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
@@ -69,4 +70,4 @@ def succeeds(ocp: OCP, method: Any, x0: Array, within: float) -> Array:
     best = np.minimum(run.cost, np.where(fair, judged.cost, np.inf))
     ok = run.success & ~(run.violation > VIOLATION)
     with np.errstate(invalid="ignore"):
-        return np.asarray(ok & (100 * (run.cost - best) <= within * np.maximum(np.abs(best), COST_FLOOR)))
+        return np.asarray(ok & (per_cent(run.cost - best, best, usual_sizes(ocp).cost) <= within))

@@ -14,7 +14,7 @@ from nocl.system import System
 if TYPE_CHECKING:
     from nocl.data import Dataset, Solution, Trajectory
     from nocl.exports.casadi_forms import to_casadi
-    from nocl.exports.interop import to_acados, to_control, to_do_mpc, to_gymnasium
+    from nocl.exports.interop import held_inputs, to_acados, to_control, to_do_mpc, to_gymnasium
     from nocl.judge import simulate
     from nocl.solvers.cnd.controller import CND, pretrained
     from nocl.solvers.cnd.training import train
@@ -26,9 +26,9 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = ["CND", "OCP", "Dataset", "Ensemble", "Gaussian", "LearnedDynamics", "Log", "Solution", "System",
-           "Trajectory", "Uniform", "comparisons", "identify", "load_ocp", "parameter", "pretrained", "simulate",
-           "smooth_abs", "smooth_max", "solvers", "split_controls", "systems", "time", "to_acados", "to_casadi",
-           "to_control", "to_do_mpc", "to_gymnasium", "to_torch", "train"]
+           "Trajectory", "Uniform", "comparisons", "held_inputs", "identify", "load_ocp", "parameter", "pretrained",
+           "simulate", "smooth_abs", "smooth_max", "solvers", "split_controls", "systems", "time", "to_acados",
+           "to_casadi", "to_control", "to_do_mpc", "to_gymnasium", "to_torch", "train"]
 
 _LAZY = {  # public name -> module: torch and the solvers are imported when first used
     "CND": "nocl.solvers.cnd.controller", "train": "nocl.solvers.cnd.training",
@@ -39,6 +39,6 @@ _LAZY = {  # public name -> module: torch and the solvers are imported when firs
     "load_ocp": "nocl.systems", "simulate": "nocl.judge",
     "to_torch": "nocl.translate.torch_functions", "to_casadi": "nocl.exports.casadi_forms",
     "to_acados": "nocl.exports.interop", "to_control": "nocl.exports.interop", "to_do_mpc": "nocl.exports.interop",
-    "to_gymnasium": "nocl.exports.interop",
+    "to_gymnasium": "nocl.exports.interop", "held_inputs": "nocl.exports.interop",
 }
 __getattr__, __dir__ = hand_on(__name__, _LAZY)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -10,12 +10,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nocl.sampling import Seed
+from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.system import System
 
 SAME = 1e-3  # costs closer than this, relative, count as the same optimum
-TINY = 1e-10  # ... and absolute: costs below it are equal
+TINY = 1e-10  # ... and of the usual cost: below that, costs are equal
 ROUNDING = 1e-9  # of the time that a solution spans
+
+
+class _RowsError(ValueError, IndexError):
+    """Rows that are not there: also an IndexError, by which Python ends a loop over the rows."""
 
 
 class Controller(Protocol):
@@ -34,28 +39,44 @@ class Dataset:
     A: Array | None = None  # [N, nx, nx], df/dx
     B: Array | None = None  # [N, nx, nu], df/du
 
+    def __post_init__(self) -> None:
+        x = checks.array(self.x, [None, None], "x", "Dataset")
+        N, nx = x.shape
+        u = checks.array(self.u, [N, None], "u", "Dataset")
+        given = {"x": x, "u": u, "xdot": checks.array(self.xdot, [N, nx], "xdot", "Dataset")}
+        for name, n in (("A", nx), ("B", u.shape[1])):
+            if getattr(self, name) is not None:
+                given[name] = checks.array(getattr(self, name), [N, nx, n], name, "Dataset")
+        for name, value in given.items():
+            object.__setattr__(self, name, value)
+
     def __len__(self) -> int:
         return len(self.x)
 
     @staticmethod
     def sample(system: System, n: int, seed: Seed = 0) -> Dataset:
         """n uniform samples of the box X x U with exact labels."""
-        rng = np.random.default_rng(seed)
+        checks.instance(System, system, "system", "Dataset.sample", "of an OCP, pass ocp.system")
+        n, rng = checks.whole(n, "n", "Dataset.sample", 1), checks.generator(seed, "Dataset.sample")
         x = rng.uniform(system.lbx, system.ubx, (n, system.nx))
         return Dataset.label(system, x, rng.uniform(system.lbu, system.ubu, (n, system.nu)))
 
     @staticmethod
     def label(system: System, x: Array, u: Array) -> Dataset:
         """Exact labels at given rows x [N, nx], u [N, nu]."""
+        checks.instance(System, system, "system", "Dataset.label", "of an OCP, pass ocp.system")
         system.refuse_parameters("Dataset")
+        x = checks.array(x, [None, system.nx], "x", "Dataset.label")
         n = len(x)
+        u = checks.array(u, [n, system.nu], "u", "Dataset.label")
         A, B = (j.full() for j in system.jacobian(x.T, u.T))
         return Dataset(x, u, system.f(x.T, u.T).full().T, _blocks(A, n), _blocks(B, n))
 
 
 def _blocks(side_by_side: Array, n: int) -> Array:
     """CasADi's [r, n * c] as rows [n, r, c]."""
-    return side_by_side.reshape(side_by_side.shape[0], n, -1).transpose(1, 0, 2)
+    rows, columns = side_by_side.shape
+    return side_by_side.reshape(rows, n, columns // max(n, 1)).transpose(1, 0, 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +113,7 @@ class Solution:
     iterations: NDArray[np.int64]  # [B], of all that was tried
     V_xx: Array | None = None  # [B, K+1, nx, nx]
     tried: Array | None = None  # [B, n], the cost that each start ended at: inf, it failed; NaN, there were fewer
+    unit: Array | None = None  # [B], what costs of the problem usually are
     clearance: Array | None = None  # [B], min of all path constraints at the nodes; inf where there are none
     dense: Array | None = None  # [B, K, 4, 2 nx]: (x, costate) at both ends of intervals, their time derivatives
     p: Array | None = None  # [B, np], the parameters of each problem; None where it has none
@@ -127,21 +149,32 @@ class Solution:
     @property
     def hits(self) -> NDArray[np.int64]:
         """How many of them ended at the best cost, SAME apart at most [B]."""
-        return hits(self._tried, self.cost)
+        return hits(self._tried, self.cost, self._unit)
 
     @property
     def optima(self) -> list[Array]:
         """The costs of the local optima found, rising, and how many starts ended at each: [n, 2] for each row."""
-        return [distinct(costs) for costs in self._tried]
+        return [distinct(costs, unit) for costs, unit in zip(self._tried, self._unit, strict=True)]
 
     @property
     def _tried(self) -> Array:
         return self.cost[:, None] if self.tried is None else self.tried
 
+    @property
+    def _unit(self) -> Array:
+        """The usual cost of each row; where it is not known, the largest that was found."""
+        found = np.abs(self._tried)
+        most = found[np.isfinite(found)].max(initial=0.0)
+        return np.full(len(self), most) if self.unit is None else np.where(np.isnan(self.unit), most, self.unit)
+
     def __getitem__(self, rows: Any) -> Solution:
         """The solutions of some rows: a number, a slice, a mask or indices."""
-        rows = [rows] if isinstance(rows, (int, np.integer)) else rows
-        return Solution(**{name: value[rows] for name, value in self.arrays().items()})
+        try:
+            chosen = np.atleast_1d(np.arange(len(self))[rows])
+        except Exception:  # whatever its own conversion raises
+            raise _RowsError(f"solution[rows]: rows is {checks.shown(rows)}; expected a number, a slice, a mask or "
+                           f"indices of its {len(self)} rows") from None
+        return Solution(**{name: value[chosen] for name, value in self.arrays().items()})
 
     @staticmethod
     def join(parts: Iterable[Solution]) -> Solution:
@@ -176,6 +209,7 @@ class Solution:
     @staticmethod
     def of_arrays(arrays: dict[str, Any]) -> Solution:
         """The solution of `arrays()`; ValueError where they are not those of a Solution."""
+        checks.instance(Mapping, arrays, "arrays", "Solution.of_arrays", "what arrays() gave")
         try:
             return Solution(**arrays)
         except TypeError as error:
@@ -187,8 +221,12 @@ class Solution:
 
         NaN where there is no gain; ValueError where no row has one.
         """
+        x, t = checks.states(x, self.x.shape[2], "the Solution", "x")[0], checks.number(t, "t", "Solution.feedback")
+        if len(x) != len(self):
+            raise ValueError(f"x has {len(x)} rows; expected {len(self)}, one for each row of the Solution")
         if np.isnan(self.gain).all():
-            raise ValueError("this Solution has no `gain`: take that of NMPC.solve(x0, gains=True), or DDP's")
+            raise ValueError("this Solution has no `gain`: take that of NMPC.solve(x0, gains=True), or "
+                             "DDP's")
         b, k = np.arange(len(self)), self._interval(np.array([t]))[:, 0]
         return self.u[b, k] + np.einsum("bij,bj->bi", self.gain[b, k], x - self.x[b, k])
 
@@ -197,12 +235,12 @@ class Solution:
 
         Raises ValueError for times outside the nodes' and where `dense` is missing.
         """
-        times = np.asarray(t, dtype=np.float64)
+        times = checks.numeric(t, "t", "Solution", "a time or a list of times")
         if self.dense is None:
             raise ValueError("this Solution has no `dense`, which solution(t) interpolates: NMPC.solve gives it")
         first, last = self.t[:, 0].max(), self.t[:, -1].min()
         if times.ndim > 1 or not ((times >= first) & (times <= last)).all():
-            raise ValueError(f"t is {t!r}; expected a time or a list of times in [{first:g}, {last:g}]")
+            raise ValueError(f"t is {checks.shown(t)}; expected a time or a list of times in [{first:g}, {last:g}]")
         b, k = np.arange(len(self))[:, None], self._interval(np.atleast_1d(times))
         h = np.diff(self.t)[b, k]
         s = (np.atleast_1d(times) - self.t[b, k]) / h
@@ -219,18 +257,21 @@ class Solution:
         return np.clip(k - 1, 0, self.u.shape[1] - 1)
 
 
-def distinct(costs: Array) -> Array:
-    """(cost, how many reached it) of each local optimum among costs, rising [n, 2]; inf and NaN stand for none."""
+def distinct(costs: Array, unit: float) -> Array:
+    """(cost, how many reached it) of each local optimum among costs, rising [n, 2]; inf and NaN stand for none.
+
+    unit : the usual cost
+    """
     found = np.sort(costs[np.isfinite(costs)])
     if not found.size:
         return np.zeros((0, 2))
-    first = np.r_[True, np.diff(found) > np.maximum(SAME * np.abs(found[1:]), TINY)]
+    first = np.r_[True, np.diff(found) > np.maximum(SAME * np.abs(found[1:]), TINY * unit)]
     return np.c_[found[first], np.diff(np.r_[np.flatnonzero(first), len(found)])]
 
 
-def hits(tried: Array, best: Array) -> NDArray[np.int64]:
-    """How many of the costs tried [B, n] are the best [B]."""
-    near = tried <= (best + np.maximum(SAME * np.abs(best), TINY))[:, None]
+def hits(tried: Array, best: Array, unit: Array | float) -> NDArray[np.int64]:
+    """How many of the costs tried [B, n] are the best [B]; unit: the usual cost."""
+    near = tried <= (best + np.maximum(SAME * np.abs(best), TINY * unit))[:, None]
     return (near & np.isfinite(tried)).sum(axis=1)
 
 

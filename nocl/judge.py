@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nocl.ocp import OCP
-from nocl.scales import steps, usual_sizes
+from nocl.scales import units
 from nocl.smoothness import kinks
 from nocl.support import checks, interrupt
 from nocl.support.checks import Array
@@ -82,9 +82,11 @@ def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: i
     checks.problem(ocp, "simulate")
     check_made_for(ocp, controller, "the controller")
     rows, _ = checks.states(x0, ocp.system.nx, ocp.system.name)
-    _check_options(ocp, hold, nodes, t0)
+    t0 = _check_options(ocp, hold, nodes, t0)
+    for name, tolerance in (("rtol", rtol), ("atol", atol)):
+        checks.number(tolerance, name, "simulate", positive=True)
     values = ocp.parameters_of(p, len(rows), "simulate")
-    judge = _Judge(ocp, dynamics_function(ocp, f), values, rtol, atol)
+    judge = _Judge(ocp, dynamics_function(ocp, f), values, float(rtol), float(atol))
     jumps = _jumps(ocp, kicks, len(rows), t0)
     policy = policy_function(ocp, controller)
     if policy is not None and hold is None:
@@ -167,38 +169,36 @@ def _with_sizes(g: ca.Function, forms: Sequence[tuple[int, ...]], n_out: int, wh
     return g
 
 
-def _check_options(ocp: OCP, hold: int | None, nodes: int, t0: float) -> None:
-    if hold is not None and (not isinstance(hold, (int, np.integer)) or hold < 1):
-        raise ValueError(f"hold is {hold!r}; expected a number of intervals >= 1, or None for continuous feedback")
-    if not isinstance(nodes, (int, np.integer)) or nodes < 2:
-        raise ValueError(f"nodes is {nodes!r}; expected an integer >= 2")
-    if not 0 <= t0 < ocp.horizon:
-        raise ValueError(f"t0 is {t0!r}; expected 0 <= t0 < {ocp.horizon:g}, the horizon")
-
-
-def _numbers(value: ArrayLike, what: str) -> Array:
-    try:
-        return checks.real(value)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"simulate: {what} cannot be read: {error}; expected an array of numbers") from None
+def _check_options(ocp: OCP, hold: int | None, nodes: int, t0: float) -> float:
+    """t0, a float; ValueError where one of them is wrong."""
+    if hold is not None:
+        checks.whole(hold, "hold", "simulate (None: continuous feedback)", 1)
+    checks.whole(nodes, "nodes", "simulate", 2)
+    return checks.start_time(t0, ocp.horizon)
 
 
 def _check_delay(delay: float, most: float, of: str) -> None:
-    if not 0 <= delay <= most * (1 + 1e-9):
+    found = checks.finite(delay)
+    if found is None or not 0 <= found <= most * (1 + 1e-9):
         raise ValueError(f"delay is {delay!r}; expected 0 <= delay <= {most:g} for {of}")
 
 
 def _jumps(ocp: OCP, kicks: Kicks | None, B: int, t0: float) -> list[tuple[float, Array]]:
     """The kicks in order of time, as rows [B, nx]."""
     jumps = []
-    for time, dx in kicks or ():
-        d = _numbers(dx, f"the kick at t = {time:g}")
+    if not isinstance(kicks, (list, tuple, type(None))) or \
+            not all(isinstance(kick, (list, tuple)) and len(kick) == 2 for kick in kicks or ()):
+        raise ValueError(f"simulate: kicks is {checks.shown(kicks)}; expected a list of pairs (time, dx [nx] or "
+                         "[B, nx])")
+    for when, dx in kicks or ():
+        time = checks.between(when, -np.inf, np.inf, "the time of a kick", "simulate")
+        what, expected = f"the kick at t = {time:g}", f"finite ({ocp.system.nx},) or ({B}, {ocp.system.nx})"
+        d = checks.numeric(dx, what, "simulate", expected)
         if d.shape not in ((ocp.system.nx,), (B, ocp.system.nx)) or not np.isfinite(d).all():
-            raise ValueError(f"the kick at t = {time:g} has shape {d.shape}; expected finite ({ocp.system.nx},) or "
-                             f"({B}, {ocp.system.nx})")
+            raise ValueError(f"{what} has shape {d.shape}; expected {expected}")
         if not t0 <= time <= ocp.horizon:
             raise ValueError(f"a kick at t = {time:g}; expected a time in [{t0:g}, {ocp.horizon:g}]")
-        jumps.append((float(time), np.broadcast_to(d, (B, ocp.system.nx))))
+        jumps.append((time, np.broadcast_to(d, (B, ocp.system.nx))))
     return sorted(jumps, key=lambda jump: jump[0])
 
 
@@ -206,14 +206,15 @@ Ask = Callable[[Array, float, int], Array]  # (x [B, nx], t, interval) -> u [B, 
 
 
 def _open_loop(ocp: OCP, controls: ArrayLike, B: int, hold: int | None, t0: float) -> tuple[Ask, int]:
-    u = _numbers(controls, "the controls")
+    u = checks.numeric(controls, "the controls", "simulate", f"[B, K, nu] = [{B}, K, {ocp.system.nu}]")
     if u.ndim == 2 and B == 1:
         u = u[None]
     if u.ndim != 3 or u.shape[0] != B or u.shape[2] != ocp.system.nu or u.shape[1] < 1:
         raise ValueError(f"controls have shape {np.shape(controls)}; expected [B, K, nu] = [{B}, K, {ocp.system.nu}]: "
                          "one row of K held controls for each x0")
     if hold not in (None, u.shape[1]):
-        raise ValueError(f"hold is {hold}, but the controls have K = {u.shape[1]} intervals: leave hold out")
+        raise ValueError(f"hold is {hold}, but the controls have K = {u.shape[1]} intervals; expected these: leave "
+                         "hold out")
     return (lambda x, t, k: u[:, k]), u.shape[1]
 
 
@@ -245,14 +246,24 @@ def _feedback(ocp: OCP, controller: Any, policy: ca.Function | None, p: Array) -
     columns = [p.T] if ocp.np else []
 
     def ask(x: Array, t: float, k: int) -> Array:
-        answer = controller(x, t, *more) if policy is None else policy(x.T, t, *columns).full().T
-        u = np.asarray(answer, dtype=np.float64)
+        answer = answer_of(controller, x, t, *more) if policy is None else policy(x.T, t, *columns).full().T
+        u = checks.numeric(answer, "the controller's answer", "simulate", f"[B, nu] = [{len(x)}, {nu}]")
         if u.shape != (len(x), nu):
             raise ValueError(f"the controller answered with shape {u.shape} at t = {t:g}; expected [B, nu] = "
                              f"[{len(x)}, {nu}] for x of shape {x.shape}")
         return u
 
     return ask
+
+
+def answer_of(controller: Any, x: Array, t: float, *p: Array | None) -> Any:
+    """A callable's answer; ValueError where it does not take (x, t), or (x, t, p)."""
+    try:
+        return controller(x, t, *p)
+    except TypeError as error:
+        form = "(x [B, nx], t, p [B, np])" if p else "(x [B, nx], t)"
+        raise ValueError(f"the controller raised {error} at t = {t:g}; expected a callable {form} -> u [B, nu]"
+                         ) from error
 
 
 class _Judge:
@@ -319,8 +330,8 @@ class _Judge:
     @cached_property
     def unit(self) -> Array:
         """What 1 stands for in each of z, for CVODES' absolute tolerance; 1 in ordinary problems."""
-        sizes = usual_sizes(self.ocp)
-        return np.r_[steps(sizes.x), steps(sizes.cost)]
+        of = units(self.ocp)
+        return np.r_[of.x, of.cost]
 
     def sized(self, z: Any) -> Any:
         return z if (self.unit == 1).all() else z * self.unit
@@ -331,7 +342,7 @@ class _Judge:
     def integrate(self, solver: ca.Function, z: Array, p: Any) -> tuple[Array | None, float]:
         """(states at the solver's times, last quadrature), or None where CVODES fails or yields NaN."""
         try:
-            with interrupt.deferred():
+            with interrupt.kept():
                 result = solver(x0=z / self.unit, p=p)
         except RuntimeError:
             return None, np.nan

@@ -81,8 +81,7 @@ class OCP:
     penalty_margin: float = field(default=0.005, kw_only=True)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.system, System):
-            raise ValueError(f"OCP: system is a {type(self.system).__name__}; expected a nocl.System")
+        checks.instance(System, self.system, "system", "OCP")
         s, owner = self.system, f"OCP on {self.system.name!r}"
         for name in ("horizon", "penalty", "penalty_margin"):
             self._set(**{name: checks.number(getattr(self, name), name, owner, positive=name == "horizon")})
@@ -164,7 +163,8 @@ class OCP:
 
     def moments(self, n: int, seed: int = 0) -> dict[str, Array]:
         """n random times in [0, T] and parameters, as {"t": [n], "p": [n, np]}: for what is found out by trying."""
-        return {"t": np.random.default_rng([seed, 1]).uniform(0, self.horizon, n), "p": self.sample_parameters(n)}
+        return {"t": sampling.own_numbers(seed, 1).uniform(0, self.horizon, n),
+                "p": self.sample_parameters(n, sampling.own_numbers(seed, 2))}
 
     def _check_initial_states(self, owner: str) -> None:
         d = self.initial_states
@@ -358,10 +358,15 @@ class OCP:
             raise ValueError(f"OCP on {self.system.name!r}: the goal depends on {', '.join(self.parameter_names)}: "
                              "pass p to from_goal")
         if not isinstance(x, (ca.SX, ca.MX)):
-            rows = np.asarray(x, dtype=np.float64) - self._goal_beside(np.ndim(x), p)
+            given = checks.numeric(x, "x", "from_goal", f"numbers [..., {self.system.nx}]")
+            if given.shape[-1:] != (self.system.nx,):
+                raise ValueError(f"from_goal: x has shape {given.shape}; expected [..., {self.system.nx}]")
+            rows = given - self._goal_beside(given.ndim, p)
             for i in self.periodic:
                 rows[..., i] -= 2 * np.pi * np.round(rows[..., i] / (2 * np.pi))
             return rows
+        if x.shape != (self.system.nx, 1):
+            raise ValueError(f"from_goal: x has shape {x.shape}; expected a column ({self.system.nx}, 1)")
         d: Any = x - (self.goal(p)[0] if self.goal_varies else ca.DM(self.x_goal))
         for i in self.periodic:
             d[i] = ca.remainder(d[i], 2 * np.pi)
@@ -394,7 +399,7 @@ class OCP:
         R and P are numbers (times the identity), diagonals [n] or symmetric positive semidefinite matrices [n, n]. The
         goal may be expressions of p, and follows it.
         """
-        owner = f"OCP on {system.name!r}"
+        owner = f"OCP on {checks.instance(System, system, 'system', 'OCP.quadratic').name!r}"
         du = system.u - _symbolic(u_goal, system.nu, "u_goal", owner)
         dx = system.x - _symbolic(x_goal, system.nx, "x_goal", owner)
         return cls(system, running=_quadratic(checks.weight(R, system.nu, "R", owner), du),
@@ -434,24 +439,33 @@ class OCP:
             return np.zeros(0)
         at = self.moments(PLACES + 1)
         at["p"][-1] = self.nominal
-        return scales(self.functions, np.vstack([self.initial_states.sample(PLACES, 0), self.x_goal]), self.moments, at)
+        places = self.initial_states.sample(PLACES, sampling.own_numbers(0))
+        return scales(self.functions, np.vstack([places, self.x_goal]), self.moments, at)
 
     def least(self, x: Array, t: Any = None, p: Array | None = None) -> Array:
         """The least value [B, number of them] of each path constraint along states x [B, n, nx]; inf for NaN.
 
         t [n] or [B, n] and p [B, np] where the problem has them.
         """
+        n = self.system.nx
+        x = checks.numeric(x, "x", "OCP.least", f"states [B, n, {n}]")
+        if x.ndim != 3 or x.shape[2] != n or not x.shape[1]:
+            raise ValueError(f"OCP.least: x has shape {x.shape}; expected [B, n, {n}]")
         if not self.path_constraints:
             return np.full((len(x), 0), np.inf)
-        B, n = x.shape[:2]
-        times = None if t is None else np.broadcast_to(t, (B, n)).ravel()
-        rows = None if p is None else np.repeat(p, n, axis=0)
-        h = self.h(*self.functions.node.columns(x=x.reshape(-1, x.shape[2]), t=times, p=rows)).full()
-        h = h.reshape(len(self.path_constraints), B, n)
+        B, nodes = x.shape[:2]
+        times = None if t is None else np.broadcast_to(t, (B, nodes)).ravel()
+        rows = None if p is None else np.repeat(p, nodes, axis=0)
+        h = self.h(*self.functions.node.columns(x=x.reshape(-1, n), t=times, p=rows)).full()
+        h = h.reshape(len(self.path_constraints), B, nodes)
         return np.where(np.isfinite(h), h, np.inf).min(axis=2, initial=np.inf).T
 
     def violation(self, least: Array) -> Array:
         """The largest violation of a path constraint as a share of its scale [B], of least values [B, m]; 0: none."""
+        m = len(self.path_constraints)
+        least = checks.numeric(least, "least", "OCP.violation", f"least values [B, {m}]")
+        if least.ndim != 2 or least.shape[1] != m or np.isnan(least).any():
+            raise ValueError(f"OCP.violation: least is {checks.shown(least)}; expected [B, {m}], as OCP.least gives it")
         return np.asarray((-least / self.constraint_scales).max(axis=1, initial=0.0)) + 0.0
 
     @property
@@ -493,6 +507,7 @@ class OCP:
     @staticmethod
     def from_data(data: Mapping[str, Any]) -> OCP:
         """The problem that to_data wrote, with new symbols; ValueError for anything else."""
+        checks.instance(Mapping, data, "data", "not an OCP written by nocl", "what to_data gave")
         try:
             system = System.from_data(data["system"])
             p = known.from_data(data.get("p", ()))
@@ -508,7 +523,8 @@ class OCP:
                        path_constraints=dict(zip(data["path_constraints"], constraints, strict=True)),
                        penalty=data["penalty"], penalty_margin=data["penalty_margin"])
         except MALFORMED as error:
-            raise ValueError(f"not an OCP written by nocl: {type(error).__name__}: {error}") from error
+            raise ValueError(f"not an OCP written by nocl: {type(error).__name__}: {error}; expected what to_data "
+                             "gave") from error
 
     def __reduce__(self) -> tuple[Any, ...]:
         return OCP.from_data, (self.to_data(),)  # bare SX does not pickle

@@ -6,6 +6,7 @@ and loads in any version of CasADi.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,8 +17,8 @@ import torch
 from torch import Tensor
 
 from nocl.nets import MLP, FeatureNet
-from nocl.support.checks import MALFORMED
-from nocl.support.store import SUFFIX, read_tensors, write_tensors
+from nocl.support import checks
+from nocl.support.store import SUFFIX, read_tensors, reading, write_tensors
 from nocl.translate.instructions import from_data, to_data
 
 
@@ -30,7 +31,7 @@ class Record:
     card: Mapping[str, Any]
 
 
-def save(folder: str | Path, kind: str, *, nets: Mapping[str, FeatureNet],
+def save(folder: str | os.PathLike[str], kind: str, *, nets: Mapping[str, FeatureNet],
          functions: Mapping[str, ca.Function] | None = None, card: Mapping[str, Any] | None = None) -> Path:
     """Write folder/KIND.safetensors, the whole record in one atomic file; a folder that is missing is made."""
     tensors = {f"{name}.{key}": value for name, net in nets.items() for key, value in net.state_dict().items()}
@@ -41,26 +42,23 @@ def save(folder: str | Path, kind: str, *, nets: Mapping[str, FeatureNet],
     return path
 
 
-def load(folder: str | Path, kind: str) -> Record:
+def load(folder: str | os.PathLike[str], kind: str) -> Record:
     """What `save` wrote, bit by bit; ValueError for a missing, truncated, altered or foreign file."""
     path = _existing(folder, kind)
     tensors, structure = read_tensors(path, kind)
-    try:
+    with reading(path, f"a {kind!r} record"):
         nets = {name: _build_net(data, _below(name, tensors), f"{path}: {name}")
                 for name, data in structure["nets"].items()}
         functions = {name: from_data(data) for name, data in structure["functions"].items()}
         return Record(nets, functions, structure["card"])
-    except MALFORMED as error:
-        raise ValueError(f"{path}: {type(error).__name__} {error} in its structure; expected a {kind!r} record: "
-                         "save it again") from error
 
 
-def save_net(folder: str | Path, name: str, net: FeatureNet) -> Path:
+def save_net(folder: str | os.PathLike[str], name: str, net: FeatureNet) -> Path:
     """Write folder/NAME.safetensors, one network."""
     return save(folder, name, nets={"net": net})
 
 
-def load_net(folder: str | Path, name: str) -> FeatureNet:
+def load_net(folder: str | os.PathLike[str], name: str) -> FeatureNet:
     """The network that save_net wrote; errors as in `load`."""
     nets = load(folder, name).nets
     if set(nets) != {"net"}:
@@ -69,14 +67,15 @@ def load_net(folder: str | Path, name: str) -> FeatureNet:
     return nets["net"]
 
 
-def _file(folder: str | Path, kind: str) -> Path:
+def _file(folder: str | os.PathLike[str], kind: str) -> Path:
     if not kind or kind.startswith(".") or not all(c.isalnum() or c in "_.-" for c in kind):
         raise ValueError(f"the name of a record is {kind!r}; expected letters, digits, _ and -: it names a file")
-    return Path(folder) / (kind + SUFFIX)
+    return checks.folder(folder, "folder", kind) / (kind + SUFFIX)
 
 
-def _existing(folder: str | Path, kind: str) -> Path:
-    path, folder = _file(folder, kind), Path(folder)
+def _existing(folder: str | os.PathLike[str], kind: str) -> Path:
+    path = _file(folder, kind)
+    folder = path.parent
     if not folder.is_dir():
         raise ValueError(f"{folder} is not a folder; expected one that holds {path.name}: check the path")
     if not path.is_file():
@@ -117,6 +116,8 @@ def _build_net(data: Mapping[str, Any], weights: Mapping[str, Tensor], owner: st
                          f"{expected.get(key, 'no such tensor')}: the file does not fit its own structure, save it "
                          "again")
     for key, value in weights.items():
+        if not value.is_floating_point():
+            raise ValueError(f"{owner}: the tensor {key} is {value.dtype}; expected real weights: save it again")
         if not torch.isfinite(value).all():
             raise ValueError(f"{owner}: the tensor {key} holds NaN or inf; expected finite weights: what was saved is "
                              "of no use, train it again")

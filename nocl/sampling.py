@@ -8,19 +8,22 @@ from typing import Any
 
 import numpy as np
 
-from nocl.support.checks import Array, Vector, vector
+from nocl.support.checks import Array, Vector, generator, numeric, vector, whole
 
 Seed = int | np.random.Generator
+STREAM = 0x6E6F636C  # nocl's own random numbers: never those of sample(n, seed), whatever the seed
 
 
 def _length(value: Vector, name: str, owner: str) -> int:
-    try:
-        shape = np.shape(value)
-    except ValueError:
-        raise ValueError(f"{owner}: {name} is {value!r}; expected a vector: pass one number per state") from None
+    shape = numeric(value, name, owner, "a vector: pass one number per state").shape
     if len(shape) != 1 or shape[0] == 0:
         raise ValueError(f"{owner}: {name} has shape {shape}, expected a vector: pass one number per state")
     return int(shape[0])
+
+
+def own_numbers(*key: int) -> np.random.Generator:
+    """Random numbers for what is no sample of the user's: the states of comparisons are never drawn."""
+    return np.random.default_rng([*key, STREAM])
 
 
 def short(vector: Array) -> str:
@@ -52,8 +55,8 @@ class Gaussian:
 
     def sample(self, n: int, seed: Seed = 0) -> Array:
         """n independent states [n, nx]; the same seed gives the same states."""
-        rng = np.random.default_rng(seed)
-        return self.mean + self.std * rng.standard_normal((n, self.n))
+        rng = generator(seed, "Gaussian.sample")
+        return self.mean + self.std * rng.standard_normal((whole(n, "n", "Gaussian.sample"), self.n))
 
     def __repr__(self) -> str:
         return f"Gaussian(mean={short(self.mean)}, std={short(self.std)})"
@@ -84,8 +87,8 @@ class Uniform:
 
     def sample(self, n: int, seed: Seed = 0) -> Array:
         """n independent states [n, nx]; the same seed gives the same states."""
-        rng = np.random.default_rng(seed)
-        return rng.uniform(self.lb, self.ub, (n, self.n))
+        rng = generator(seed, "Uniform.sample")
+        return rng.uniform(self.lb, self.ub, (whole(n, "n", "Uniform.sample"), self.n))
 
     def __repr__(self) -> str:
         return f"Uniform(lb={short(self.lb)}, ub={short(self.ub)})"

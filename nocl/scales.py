@@ -10,6 +10,7 @@ from functools import lru_cache
 import numpy as np
 
 from nocl.ocp import OCP
+from nocl.sampling import own_numbers
 from nocl.support.checks import Array
 
 SAMPLES = 256
@@ -27,14 +28,20 @@ class Sizes:
 
 @lru_cache(maxsize=32)
 def usual_sizes(ocp: OCP) -> Sizes:
-    s, rng = ocp.system, np.random.default_rng(0)
-    x = ocp.initial_states.sample(SAMPLES, 0)
+    s, rng = ocp.system, own_numbers(0)
+    x = np.clip(ocp.initial_states.sample(SAMPLES, rng), s.lbx, s.ubx)  # far outside X costs are not usual
     u = rng.uniform(s.lbu, s.ubu, (SAMPLES, s.nu))
     of, at = ocp.functions, ocp.moments(SAMPLES)
     L, G = (g(*a.columns(x=x, u=u, **at)).full() for g, a in ((of.L, of.arguments), (of.G, of.end)))
     J = np.abs(ocp.horizon * L) + np.abs(G)
     J = J[np.isfinite(J) & (J > 0)]
     return Sizes((s.ubx - s.lbx) / 2, (s.ubu - s.lbu) / 2, float(np.median(J)) if J.size else 1.0)
+
+
+def units(ocp: OCP) -> Sizes:
+    """What solvers take for 1 of each state and control, and of the cost: a usual size, as a power of STEP."""
+    usual = usual_sizes(ocp)
+    return Sizes(steps(usual.x), steps(usual.u), float(steps(usual.cost)))
 
 
 def steps(size: Array | float) -> Array:

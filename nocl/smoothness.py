@@ -10,11 +10,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from nocl import pretty
+from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.system import System
 from nocl.translate.instructions import Instruction, instructions
@@ -23,6 +25,7 @@ SAMPLES = 256  # points of the box
 BISECTIONS = 60
 STEP = 1e-4  # from a switching point to either side, in units of the way between two samples; and a hundredth of it
 FALLS = 0.5  # a smooth bend's slopes differ a hundred times less a hundred times nearer, a kink's as much
+TINY = 1e-150  # a width whose square is not 0
 LEAST = 1e-6  # of the largest slope in the box: less is no kink
 
 
@@ -122,12 +125,28 @@ def linear_controls(running: ca.SX, xdot: ca.SX, u: ca.SX) -> list[str]:
 
 def smooth_abs(e: ca.SX, width: float) -> ca.SX:
     """sqrt(e^2 + width^2) - width: |e| with its kink rounded off over about `width`, in the unit of e; 0 at e = 0."""
+    (e,) = _scalars("smooth_abs", e=e)
+    width = checks.between(width, TINY, checks.ORDINARY, "width", "smooth_abs")
     return ca.sqrt(e**2 + width**2) - width
 
 
 def smooth_max(a: ca.SX, b: ca.SX, width: float) -> ca.SX:
     """max(a, b) with its kink rounded off over about `width`, in their unit; at most width / 2 above it."""
+    (a, b) = _scalars("smooth_max", a=a, b=b)
+    width = checks.between(width, TINY, checks.ORDINARY, "width", "smooth_max")
     return (a + b + ca.sqrt((a - b) ** 2 + width**2)) / 2
+
+
+def _scalars(owner: str, **given: Any) -> list[Any]:
+    """CasADi scalars of one kind, or numbers; ValueError otherwise."""
+    found = [checks.finite(e) for e in given.values()]
+    for (name, e), number in zip(given.items(), found, strict=True):
+        if not (isinstance(e, (ca.SX, ca.MX)) and e.is_scalar() if number is None else abs(number) < checks.ORDINARY):
+            raise ValueError(f"{owner}: {name} is {checks.shown(e)}; expected a scalar expression of CasADi, or a "
+                             "number of ordinary size")
+    if len({type(e) for e, number in zip(given.values(), found, strict=True) if number is None}) > 1:
+        raise ValueError(f"{owner}: got SX and MX; expected expressions of one kind: use the system's own symbols")
+    return [e if number is None else number for e, number in zip(given.values(), found, strict=True)]
 
 
 def split_controls(system: System, names: Sequence[str]) -> System:
@@ -135,8 +154,8 @@ def split_controls(system: System, names: Sequence[str]) -> System:
 
     Raises ValueError for names of no control, and for controls that cannot have both signs.
     """
-    unknown = [n for n in names if n not in system.control_names]
-    if unknown or isinstance(names, str):
+    checks.instance(System, system, "system", "split_controls", "of an OCP, pass ocp.system")
+    if not isinstance(names, (list, tuple)) or any(n not in system.control_names for n in names):
         raise ValueError(f"split_controls: got {names!r}; expected a list of names of controls "
                          f"({', '.join(system.control_names)})")
     parts, value, lb, ub, at = list[ca.SX](), list[ca.SX](), list[float](), list[float](), system.arguments

@@ -206,6 +206,9 @@ class System:
         x, u = checks.vector(x, self.nx, "x", owner), checks.vector(u, self.nu, "u", owner)
         rows = parameters.rows(p, self.parameter_names, 1, owner)
         A, B = self.jacobian(*self.arguments.columns(x=x, u=u, t=t, p=rows))
+        if not (np.isfinite(A.full()).all() and np.isfinite(B.full()).all()):
+            raise ValueError(f"{owner}: the Jacobian is NaN or inf at x = {checks.shown(x)}, u = {checks.shown(u)}; "
+                             "expected a point where xdot is differentiable")
         return A.full(), B.full()
 
     def at(self, p: Any) -> System:
@@ -218,6 +221,8 @@ class System:
     def difference(self, other: System, equations: bool = True) -> str:
         """What tells another system from this one, names of states and controls or (where asked) parameters and
         equations; "" where they are the same."""
+        checks.instance(System, other, "other", f"{self.name}.difference", "of an OCP, pass ocp.system")
+        checks.flag(equations, "equations", f"{self.name}.difference")
         parameters = [("parameters", self.parameter_names, other.parameter_names)] if equations else []
         for what, own, theirs in (("states", self.state_names, other.state_names),
                                   ("controls", self.control_names, other.control_names), *parameters):
@@ -241,11 +246,18 @@ class System:
 
     def under(self, f: ca.Function) -> System:
         """The system with another f:(x, u[, t][, p]) -> xdot for its equations, in its own symbols and SX."""
-        f = f if f.is_a("SXFunction") else f.expand()
+        sizes = [v.numel() for v in self.arguments.inputs]
+        if not isinstance(f, ca.Function) or [f.numel_in(i) for i in range(f.n_in())] != sizes or \
+                [f.numel_out(i) for i in range(f.n_out())] != [self.nx]:
+            form = ", ".join(f"{name} [{n}]" for name, n in zip(self.arguments.names, sizes, strict=True))
+            raise ValueError(f"{self.name}.under: f is {checks.shown(f)}; expected a casadi.Function ({form}) -> xdot "
+                             f"[{self.nx}]")
+        f = f if f.is_a("SXFunction") else instructions.expand(f)
         return replace(self, xdot=f(*self.arguments.inputs))
 
     def unit(self, name: str) -> str:
         """The unit of a state, control or parameter for an axis label, like 'theta [rad]' or just 'theta'."""
+        checks.word(name, (*self.names, *self.parameter_names), "name", f"{self.name}.unit")
         return f"{name} [{self.units[name]}]" if name in self.units else name
 
     def __repr__(self) -> str:
@@ -277,6 +289,7 @@ class System:
     @staticmethod
     def from_data(data: Mapping[str, Any]) -> System:
         """The system that to_data wrote, with new symbols; ValueError for anything else."""
+        checks.instance(Mapping, data, "data", "not a System written by nocl", "what to_data gave")
         try:
             x, u = (ca.vertcat(*map(ca.SX.sym, data[names])) for names in ("x", "u"))
             p = parameters.from_data(data.get("p", ()))
@@ -285,7 +298,8 @@ class System:
             return System(data["name"], x=x, u=u, xdot=xdot, p=p, angles=data["angles"], units=data["units"],
                           **{name: data[name] for name in ("lbu", "ubu", "lbx", "ubx")})
         except MALFORMED as error:
-            raise ValueError(f"not a System written by nocl: {type(error).__name__}: {error}") from error
+            raise ValueError(f"not a System written by nocl: {type(error).__name__}: {error}; expected what to_data "
+                             "gave") from error
 
     @staticmethod
     def from_casadi(f: ca.Function, *, lbu: Vector, ubu: Vector, lbx: Vector, ubx: Vector, **options: Any) -> System:
@@ -308,14 +322,14 @@ def _from_casadi(f: ca.Function, *, name: str | None = None, states: Sequence[st
                          "columns")
     x = _named(states, f.size1_in(0), "x", "states", f.name())
     u = _named(controls, f.size1_in(1), "u", "controls", f.name())
-    return System(name or f.name(), x=x, u=u, xdot=instructions.expand(f)(x, u), **options)
+    return System(f.name() if name is None else name, x=x, u=u, xdot=instructions.expand(f)(x, u), **options)
 
 
 def _named(names: Sequence[str] | None, n: int, letter: str, what: str, owner: str) -> ca.SX:
     """A column of n symbols: `names`, or x0, x1, ..."""
-    chosen = [f"{letter}{i}" for i in range(n)] if names is None else list(names)
+    chosen = [f"{letter}{i}" for i in range(n)] if names is None else checks.words(names, what, "System.from_casadi")
     if len(chosen) != n:
-        raise ValueError(f"System.from_casadi: {what} has {len(chosen)} names; {owner} has {n}: name each")
+        raise ValueError(f"System.from_casadi: {what} has {len(chosen)} names; {owner} has {n}: give each a name")
     return ca.vertcat(*map(ca.SX.sym, chosen))
 
 

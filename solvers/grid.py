@@ -10,45 +10,20 @@ the costate there, and add up with those of the running cost.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from nocl.data import Solution
 from nocl.functions import Functions
 from nocl.ocp import OCP
+from nocl.sampling import own_numbers
 from nocl.scales import usual_sizes
+from nocl.substeps import FINEST, Grid, grid_of
 from nocl.support.checks import Array
 
 ROWS = 4  # solutions that are looked at
-FINEST = 128  # steps in an interval, taken for the truth
-TRIED = (1, 2, 4, 8, 16, 32)  # substeps, in this order
-COARSE = 1e-2  # a larger error is worth a warning
-WANTED = 1e-4  # ... and a smaller one is what substeps are chosen for
 SMALL = 1e-3  # of the usual cost: below it, errors count as shares of that
-
-
-@dataclass(frozen=True)
-class Grid:
-    """What was found of solutions on a grid."""
-
-    step: float  # length of an interval
-    substeps: int
-    error: float  # the largest, of a state after an interval or of a cost, as a share of usual ones
-    needed: int | None  # substeps with which it is WANTED; None: of those TRIED none is enough
-    then: float  # the error with those, or with the most that were tried
-    fastest: float  # time constant of f along the solutions; inf for none
-
-    @property
-    def coarse(self) -> bool:
-        return not self.error <= COARSE
-
-    def __str__(self) -> str:
-        remedy = (f"with substeps={self.needed} plan and plant agree to {100 * self.then:.2g} %" if self.needed else
-                  f"not even with substeps={TRIED[-1]} do plan and plant agree ({100 * self.then:.2g} %): more "
-                  "intervals, or an equation for what settles at once in place of its dynamics")
-        return (f"the grid is too coarse for this system: its fastest time constant is {_time(self.fastest)}, a step "
-                f"{_time(self.step / self.substeps)}, and plan and plant differ by {100 * self.error:.2g} %; {remedy}")
+Stages = dict[str, Array]  # x [n, nx], u [n, nu], t [n], p [n, np]
 
 
 def measured(ocp: OCP, functions: Functions, solution: Solution, substeps: int) -> Grid | None:
@@ -56,19 +31,26 @@ def measured(ocp: OCP, functions: Functions, solution: Solution, substeps: int) 
     solution = solution[np.flatnonzero(solution.success)[:ROWS]]
     if not len(solution):
         return None
-    error = _errors(ocp, functions, solution)
-    now = error(substeps)
-    more = [n for n in TRIED if n >= substeps]
-    needed = next((n for n in more if error(n) <= WANTED), None) if now > WANTED else substeps
     step = float(np.diff(solution.t, axis=1).max())
-    return Grid(step, substeps, now, needed, error(needed or TRIED[-1]), _fastest(functions, solution))
+    return grid_of(step, substeps, _errors(ocp, functions, solution), fastest(functions, _stages(solution)))
+
+
+def fastest_at_start(ocp: OCP, functions: Functions) -> float:
+    """The shortest time constant of f at some initial states under u*."""
+    x, p = firsts(ocp)
+    return fastest(functions, {"x": x, "u": ocp.goals(p)[1], "t": np.zeros(ROWS), "p": p})
+
+
+def firsts(ocp: OCP) -> tuple[Array, Array]:
+    """A few initial states [ROWS, nx] and parameters [ROWS, np], always the same."""
+    return ocp.initial_states.sample(ROWS, own_numbers(0)), ocp.sample_parameters(ROWS, own_numbers(0, 2))
 
 
 def _errors(ocp: OCP, functions: Functions, s: Solution) -> Callable[[int], float]:
     """substeps -> the largest error."""
     B, K, nx = len(s), s.u.shape[1], s.x.shape[2]
     x, h = s.x[:, :-1].reshape(-1, nx).T, np.diff(s.t, axis=1).reshape(1, -1)
-    step, moment = functions.step(), _stages(functions, s)
+    step, moment = functions.step(), _stages(s)
     usual = usual_sizes(ocp)
     cost, slope = np.maximum(np.abs(s.cost), SMALL * usual.cost), s.V_x[:, 1:].reshape(-1, nx).T
     known: dict[int, float] = {}
@@ -97,7 +79,7 @@ def _errors(ocp: OCP, functions: Functions, s: Solution) -> Callable[[int], floa
     return error
 
 
-def _stages(functions: Functions, s: Solution) -> dict[str, Array]:
+def _stages(s: Solution) -> Stages:
     """The start of each interval of all solutions, a row each: x, u, t, p."""
     K = s.u.shape[1]
     p = np.zeros((len(s), 0)) if s.p is None else s.p
@@ -105,14 +87,10 @@ def _stages(functions: Functions, s: Solution) -> dict[str, Array]:
             "p": np.repeat(p, K, axis=0)}
 
 
-def _fastest(functions: Functions, s: Solution) -> float:
-    """The shortest time constant of the linearised f at the solutions' nodes."""
-    nx = s.x.shape[2]
-    A = functions.jacobian(*functions.arguments.columns(**_stages(functions, s)))[0].full()
+def fastest(functions: Functions, at: Stages) -> float:
+    """The shortest time constant of the linearised f at stages x [n, nx], u [n, nu], t [n], p [n, np]; inf for none."""
+    nx = at["x"].shape[1]
+    A = functions.jacobian(*functions.arguments.columns(**at))[0].full()
     A = A.reshape(nx, -1, nx).transpose(1, 0, 2)
     rate = np.abs(np.linalg.eigvals(A[np.isfinite(A).all(axis=(1, 2))]).real).max(initial=0.0)
     return float(1 / rate) if rate > 0 else np.inf
-
-
-def _time(seconds: float) -> str:
-    return f"{seconds:.3g} s" if not seconds < 1 else f"{1000 * seconds:.3g} ms"

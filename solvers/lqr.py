@@ -21,7 +21,7 @@ from scipy.interpolate import BSpline, make_interp_spline
 from scipy.linalg import LinAlgError, solve_continuous_are
 
 from nocl.ocp import OCP
-from nocl.scales import steps, usual_sizes
+from nocl.scales import units
 from nocl.support import checks
 from nocl.support.checks import Array
 
@@ -57,6 +57,7 @@ class LQR:
 
     def __init__(self, ocp: OCP, infinite: bool = False) -> None:
         checks.problem(ocp, "LQR")
+        infinite = checks.flag(infinite, "infinite", "LQR")
         ocp.refuse_parameters("LQR")
         self.ocp, self.infinite = ocp, infinite
         self.A, self.B = (j.full() for j in ocp.functions.jacobian(ocp.x_goal, ocp.u_goal))
@@ -91,7 +92,8 @@ class LQR:
                              "scale the states and costs")
         fine = np.linspace(0, 1, REFINE, endpoint=False)
         s = np.r_[(path.t[:-1, None] + np.diff(path.t)[:, None] * fine).ravel(), T]
-        spline = make_interp_spline(T - s[::-1], path.sol(s).T[::-1], k=DEGREE)
+        t = np.unique(T - s)  # next to T the first steps of a stiff one may be less than rounding apart
+        spline = make_interp_spline(t, path.sol(T - t).T, k=DEGREE)
         return BSpline(spline.t, spline.c * of.unit.ravel(), DEGREE)
 
     def _solve_infinite(self) -> Array:
@@ -110,8 +112,8 @@ class LQR:
     @cached_property
     def _scaled(self) -> _LinearQuadratic:
         """The problem in units of the solvers' scales: its P times `unit` is P."""
-        sizes = usual_sizes(self.ocp)
-        x, u, c = steps(sizes.x), steps(sizes.u), float(steps(sizes.cost))
+        of = units(self.ocp)
+        x, u, c = of.x, of.u, of.cost
         return _LinearQuadratic(self.A / x[:, None] * x, self.B / x[:, None] * u, self.Q * x[:, None] * x / c,
                                 self.R * u[:, None] * u / c, self.S * x[:, None] * u / c,
                                 self.P_final * x[:, None] * x / c, c / (x[:, None] * x))
@@ -119,12 +121,16 @@ class LQR:
     def _gain(self, P: Array) -> Array:
         return np.asarray(np.linalg.solve(self.R, self.B.T @ P + self.S.T), dtype=np.float64)
 
+    def _time(self, t: Any) -> float:
+        """t as a float: any finite time."""
+        return checks.between(t, -np.inf, np.inf, "t", f"LQR of {self.ocp.system.name!r}")
+
     def P(self, t: float = 0.0) -> Array:
         """The Hessian of V at time t, [nx, nx]."""
         if self.infinite:
             return self._P_infinite
         n = len(self.A)
-        P = self._spline(min(max(float(t), 0.0), self.ocp.horizon)).reshape(n, n)
+        P = self._spline(min(max(self._time(t), 0.0), self.ocp.horizon)).reshape(n, n)
         return (P + P.T) / 2
 
     def K(self, t: float = 0.0) -> Array:
@@ -145,7 +151,7 @@ class LQR:
         """
         rows, single = checks.states(x, self.ocp.system.nx, self.ocp.system.name, "x")
         d = self.ocp.from_goal(rows)
-        rest = 0.0 if self.infinite else self._L_goal * (self.ocp.horizon - t) + self._G_goal
+        rest = 0.0 if self.infinite else self._L_goal * (self.ocp.horizon - self._time(t)) + self._G_goal
         V = np.einsum("bi,ij,bj->b", d, self.P(t), d) / 2 + rest
         return float(V[0]) if single else V
 
@@ -177,11 +183,10 @@ def _check_equilibrium(ocp: OCP) -> None:
     s, of = ocp.system, ocp.functions
     L_z = of.L_derivatives(ocp.x_goal, ocp.u_goal)[1].full().ravel()
     G_x = of.G_derivatives(ocp.x_goal)[1].full().ravel()
-    f, sizes = of.f(ocp.x_goal, ocp.u_goal).full().ravel(), usual_sizes(ocp)
-    x, u, c = steps(sizes.x), steps(sizes.u), float(steps(sizes.cost))
-    for what, values, unit, names in (("f", f, 1 / x, s.state_names),
-                                      ("the gradient of L", L_z, np.r_[x, u] / c, s.names),
-                                      ("the gradient of G", G_x, x / c, s.state_names)):
+    f, one = of.f(ocp.x_goal, ocp.u_goal).full().ravel(), units(ocp)
+    for what, values, unit, names in (("f", f, 1 / one.x, s.state_names),
+                                      ("the gradient of L", L_z, np.r_[one.x, one.u] / one.cost, s.names),
+                                      ("the gradient of G", G_x, one.x / one.cost, s.state_names)):
         i = int(np.argmax(np.abs(values * unit)))
         if abs(values[i] * unit[i]) > STATIONARY:
             raise ValueError(f"LQR of {s.name!r}: at the goal pair {what} is {values[i]:.4g} in {names[i]}; "

@@ -204,11 +204,14 @@ class NeuralOC:
         """What `save` wrote; raises ValueError for a missing, damaged or foreign file."""
         path = Path(folder) / FILE
         state, meta = store.load_checkpoint(path)
-        if meta.get("solver") != "neural_oc":
-            raise ValueError(f"{path} was not written by NeuralOC.save; expected a controller: name its folder")
-        net = ValueNet(**meta["net"]).double()
-        net.load_state_dict(state)
-        return cls(OCP.from_data(meta["ocp"]), net, meta["card"])
+        with store.reading(path, "a controller"):
+            if meta.get("solver") != "neural_oc":
+                raise ValueError(f"{path} was not written by NeuralOC.save; expected a controller: name its folder")
+            net = ValueNet(**meta["net"]).double()
+            net.load_state_dict(state)
+            if not all(torch.isfinite(p).all() for p in net.parameters()):
+                raise ValueError(f"{path} holds weights of NaN or inf; expected finite ones: train it again")
+            return cls(OCP.from_data(meta["ocp"]), net, meta["card"])
 
     def __repr__(self) -> str:
         facts = ", ".join(f"{k} {v:.4g}" for k, v in self.card.items() if isinstance(v, (int, float)))
@@ -216,7 +219,7 @@ class NeuralOC:
 
     def _tensors(self, x: ArrayLike, t: ArrayLike) -> tuple[Tensor, Tensor, bool]:
         rows, single = checks.states(x, self.ocp.system.nx, self.ocp.system.name, "x")
-        times = np.asarray(t, dtype=np.float64)
+        times = checks.numeric(t, "t", self.ocp.system.name, f"one time or {len(rows)}")
         if times.shape not in ((), (len(rows),)) or not ((times >= 0) & (times <= self.ocp.horizon * (1 + 1e-9))).all():
             raise ValueError(f"t is {np.array2string(times, threshold=4)}; expected one time or {len(rows)}, "
                              f"each in [0, {self.ocp.horizon:g}]")

@@ -20,6 +20,7 @@ class Options:
 
     intervals: int = 80  # of a plan's held controls
     seed: int = 0  # of what is random in the method
+    substeps: int | None = None  # Runge-Kutta steps in each interval; None: chosen by what is solved first
 
 
 @dataclass(frozen=True)
@@ -70,15 +71,17 @@ def _function(name: str) -> Callable[..., Any]:
     return found
 
 
+PLANS = ("intervals", "seed", "substeps")  # what plans take
+
 METHODS: dict[str, Method] = {method.name: method for method in (
     Method("cnd", "CND", "the run's own controller"),
     Method("nmpc", "NMPC", "multiple shooting, in open loop", "nocl.solvers.nmpc.solver:NMPC",
-           takes=("intervals", "seed")),
+           takes=PLANS),
     Method("lqr", "LQR", "linear feedback about the goal", "nocl.solvers.lqr:LQR"),
     Method("ddp", "DDP", "the best of many starts, in open loop", "nocl.solvers.ddp.global_search:global_ddp",
-           takes=("intervals", "seed")),
+           takes=PLANS),
     Method("nmpc-loop", "NMPC-LOOP", "NMPC in closed loop", "nocl.solvers.nmpc.solver:closed_loop",
-           takes=("intervals", "seed")),
+           takes=PLANS),
     Method("neural-oc", "NeuralOC", "a value network, trained for minutes to hours on the exact f",
            "nocl.solvers.neural_oc:train_neural_oc", check="nocl.solvers.neural_oc:applicable", takes=("seed",)),
     Method("level-sets", "level sets", "the HJB equation on a grid, up to 3 states",

@@ -18,6 +18,7 @@ from types import ModuleType
 from typing import Any
 
 from nocl.ocp import OCP
+from nocl.support import checks
 from nocl.support.lazy import hand_on
 
 NAMES = ("cartpole", "acrobot", "quadrotor", "dubins", "pendulum", "double_integrator", "van_der_pol")
@@ -36,7 +37,7 @@ def load_ocp(name_or_path: str | os.PathLike[str], **options: Any) -> OCP:
     if not isinstance(name_or_path, (str, os.PathLike)):
         raise ValueError(f"load_ocp got a {type(name_or_path).__name__}; expected a name ({', '.join(NAMES)}) "
                          "or the path of a .py file")
-    text = os.fspath(name_or_path)
+    text = os.fsdecode(name_or_path)
     return _bundled(text, options) if text in NAMES else _from_file(_user_file(text), text, options)
 
 
@@ -57,7 +58,7 @@ def _bundled(name: str, options: Mapping[str, Any]) -> OCP:
 
 def _user_file(text: str) -> Path:
     """The file that `text` names; ValueError unless it is a Python file."""
-    path = Path(text)
+    path = checks.folder(text, "the file", "load_ocp")
     remedy = f"expected a Python file that defines `ocp`, or one of {', '.join(NAMES)}"
     if path.suffix == ".py":
         if not path.is_file():

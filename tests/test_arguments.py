@@ -11,6 +11,7 @@ import nocl
 from nocl.solvers.lqr import LQR
 from nocl.solvers.nmpc.solver import NMPC
 from nocl.support import checks, store
+from nocl.sysid import Settings
 
 NO_NUMBERS = {
     "masked": np.ma.array([0.1, 0.2], mask=[False, True]), "text": ["0.1", "0.2"], "bytes": [b"1", b"2"],
@@ -115,3 +116,35 @@ def test_the_same_equations_written_otherwise_are_the_same_system(pendulum):
     again = nocl.System.from_casadi(s.f.wrap(), states=s.state_names, controls=s.control_names, lbu=s.lbu, ubu=s.ubu,
                                     lbx=s.lbx, ubx=s.ubx)
     assert s.difference(again) == "" == s.difference(s)
+
+
+MODELS = {"no card": lambda s: s.pop("card"), "no net": lambda s: s["nets"].clear(),
+          "a list": lambda s: s.update(card=[]), "no structure": lambda s: s["card"].pop("structure"),
+          "a wrong part": lambda s: s["card"].update(parts=3), "no functions": lambda s: s["functions"].pop("linear"),
+          "a number": lambda s: s["card"].update(system=1)}
+
+
+@pytest.fixture(scope="module")
+def model(pendulum):
+    small = Settings(iterations=1, polish=0, samples=100, width=4, structure=False)
+    return nocl.identify(pendulum.system, settings=small, progress=False)
+
+
+@pytest.mark.parametrize("what", MODELS)
+def test_malformed_models_are_refused(model, tmp_path, what):
+    model.save(tmp_path)
+    tensors, structure = store.read_tensors(tmp_path / "dynamics.safetensors", "dynamics")
+    MODELS[what](structure)
+    store.write_tensors(tmp_path / "dynamics.safetensors", "dynamics", tensors, structure)
+    with pytest.raises(ValueError, match=r"expected a .* that nocl wrote: save it again"):
+        nocl.LearnedDynamics.load(tmp_path)
+
+
+@pytest.mark.parametrize("dtype", [torch.complex64, torch.int64])
+def test_weights_that_are_no_real_numbers_are_refused(model, tmp_path, dtype):
+    model.save(tmp_path)
+    path = tmp_path / "dynamics.safetensors"
+    tensors, structure = store.read_tensors(path, "dynamics")
+    store.write_tensors(path, "dynamics", {key: value.to(dtype) for key, value in tensors.items()}, structure)
+    with pytest.raises(ValueError, match="expected real weights"):
+        nocl.LearnedDynamics.load(tmp_path)

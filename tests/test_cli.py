@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import warnings
 from dataclasses import asdict
 from pathlib import Path
 
@@ -217,7 +218,8 @@ def test_an_interrupted_solve_goes_on(here, monkeypatch):
     """DDP's stages and NMPC's states so far are kept until all is solved."""
     from nocl.solvers.ddp.solver import DDP
 
-    command = ["solve", "cubic.py", "--solver", "ddp", "--n", "4", "--intervals", "9", "--workers", "1", "--out", "new"]
+    command = ["solve", "cubic.py", "--solver", "ddp", "--n", "4", "--intervals", "9", "--substeps", "1",
+               "--workers", "1", "--out", "new"]
     done, left, descend = [], [5], DDP.descend
 
     def counted(self, batch):
@@ -237,6 +239,52 @@ def test_an_interrupted_solve_goes_on(here, monkeypatch):
     assert not (here / "new" / "solutions" / "checkpoint").exists()
     with np.load(here / "new" / "solutions" / "ddp.npz") as a, np.load(here / "again" / "solutions" / "ddp.npz") as b:
         np.testing.assert_array_equal(a["u"], b["u"])
+
+
+FAST = """import casadi as ca
+import nocl
+x, z, u = ca.SX.sym("x"), ca.SX.sym("z"), ca.SX.sym("u")
+lag = nocl.System("lag", x=ca.vertcat(x, z), u=u, xdot=ca.vertcat(z, 60 * (u - z)), lbu=[-1], ubu=[1], lbx=[-3, -2],
+                  ubx=[3, 2])
+ocp = nocl.OCP(lag, horizon=4.0, running=0.1 * u**2, terminal=5 * x**2 + z**2, x_goal=[0, 0], u_goal=[0],
+               initial_states=nocl.Gaussian(mean=[1, 0], std=[0.1, 0.1]))
+"""
+WALL = """import casadi as ca
+import nocl
+p, v, u = ca.SX.sym("p"), ca.SX.sym("v"), ca.SX.sym("u")
+mass = nocl.System("mass", x=ca.vertcat(p, v), u=u, xdot=ca.vertcat(v, u), lbu=[-1], ubu=[1], lbx=[-3, -3], ubx=[3, 3])
+ocp = nocl.OCP(mass, horizon=4.0, running=0.1 * u**2, terminal=p**2 + v**2, x_goal=[0, 0], u_goal=[0],
+               initial_states=nocl.Gaussian(mean=[0.5, 1.5], std=[1e-3, 1e-3]), path_constraints={"wall": 1 - p})
+"""
+
+
+@pytest.mark.parametrize("solver", ["nmpc", "ddp"])
+def test_solve_takes_the_substeps_that_the_plant_asks_for(here, capsys, solver):
+    (here / "lag.py").write_text(FAST)
+    command = ["solve", "lag.py", "--solver", solver, "--n", "2", "--intervals", "40", "--workers", "1"]
+    with pytest.warns(UserWarning, match="so they are taken|are taken, and plan and plant agree"):
+        assert main([*command, "--out", "own"]) == 0
+    with np.load(f"own/solutions/{solver}.npz") as found:
+        np.testing.assert_allclose(found["judged_cost"], found["cost"], rtol=1e-3)
+        cost = found["cost"]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert main([*command, "--substeps", "16", "--out", "given"]) == 0
+    with np.load(f"given/solutions/{solver}.npz") as found:
+        np.testing.assert_allclose(found["cost"], cost, rtol=1e-3)
+
+
+@pytest.mark.parametrize("solver", ["nmpc", "ddp"])
+def test_solve_fails_where_nothing_was_solved(here, capsys, solver):
+    """Braking from 1.5 takes 1.125, and the wall is 0.5 away."""
+    (here / "wall.py").write_text(WALL)
+    assert main(["solve", "wall.py", "--solver", solver, "--n", "2", "--intervals", "20", "--out", "new"]) == 2
+    out, err = capsys.readouterr()
+    assert f"{solver}: 0 of 2 solved" in out
+    assert err.startswith(f"nocl: error: {solver} solved none of 2 initial states; of the first: ")
+    assert ("'wall'" if solver == "ddp" else "infeasible") in err
+    assert err.count("\n") == 1
+    assert Path(f"new/solutions/{solver}.npz").exists()
 
 
 @pytest.mark.parametrize("workers", ["0", "two", "-1"])
@@ -324,6 +372,7 @@ def test_a_run_from_a_users_file_to_its_report(here, capsys, monkeypatch):
     assert "parity ok: policy" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_controller_that_no_run_made_is_not_overwritten(here, capsys, monkeypatch):
     small(monkeypatch)
     ocp = nocl.load_ocp("cubic.py")

@@ -45,6 +45,7 @@ def here(tmp_path, monkeypatch):
     return tmp_path
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:plant. the controller costs", "ignore:plant. V is")  # a tiny training
 def test_from_a_log_to_a_controller_and_a_refusal(here, capsys):
     """identify -> train on the plant's name and box alone; the controller works on the equations that nobody showed."""

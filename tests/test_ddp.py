@@ -89,6 +89,7 @@ def test_one_state_one_control_and_one_interval():
         assert np.abs(s.V_xx[0] - 2 * S).max() < 1e-9
 
 
+@pytest.mark.slow
 def test_ten_thousand_intervals():
     S, *_ = riccati(np.array([[0, 1], [0, 0.0]]), np.array([[0.0], [1.0]]), 0.01 * np.eye(1), np.eye(2), 2.0, 10_000)
     s = solver("double_integrator", 10_000).solve([1.0, 0.0])
@@ -203,7 +204,7 @@ def test_each_problem_fails_on_its_own_and_says_so():
     finite_escape = scalar_problem(x**3 + u, 0.1 * u**2, x=x, u=u, horizon=2.0)
     solve = DDP(finite_escape, intervals=40, threads=1).solve
     good = np.linspace(-0.3, 0.3, 13)[:, None]
-    mixed = np.insert(good, [2, 5, 13], [[9.0], [-40.0], [1e200]], axis=0)
+    mixed = np.insert(good, [2, 5, 13], [[9.0], [-40.0], [1e140]], axis=0)
     bad = [2, 6, 15]
     s, alone = solve(mixed, curvature=True), solve(good, curvature=True)
     others = np.setdiff1d(np.arange(16), bad)
@@ -347,7 +348,7 @@ def test_sweep_on_networks_equals_casadis_derivatives_of_the_step(name, activati
     ocp, model, K, B = problem(name), random_model(name, activations), 6, 3
     s, n = ocp.system, ocp.system.nx
     u = np.random.default_rng(1).uniform(0.5 * s.lbu, 0.5 * s.ubu, (B, K, s.nu))
-    d = DDP(ocp, intervals=K, dynamics=model, threads=1)
+    d = DDP(ocp, intervals=K, substeps=1, dynamics=model, threads=1)
     work = Work(d, ocp.initial_states.sample(B, 0), np.zeros(B), u, None, None)
     V, V_x, V_xx = np.zeros((B, K + 1)), np.zeros((B, K + 1, n)), np.zeros((B, K + 1, n, n))
     work.backward(np.arange(B), V, V_x, V_xx)

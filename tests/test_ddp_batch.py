@@ -136,6 +136,7 @@ def test_optimum_costates_and_gains_are_nmpcs(name):
 # Hard input: each problem on its own
 
 
+@pytest.mark.slow
 def test_one_step_and_many_in_any_problem():
     for name in ("cartpole", "dubins"):
         ocp = problem(name)

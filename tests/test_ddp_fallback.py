@@ -45,7 +45,7 @@ def test_one_sweep_and_one_rollout_equal_the_compiled_ones(name, mu):
     u[:, ::3] = np.where(rng.random((B, len(u[0, ::3]), s.nu)) < 0.5, s.lbu, s.ubu)  # controls at their limits
     results = []
     for slow in (False, True):
-        d = DDP(ocp, intervals=K, threads=1)
+        d = DDP(ocp, intervals=K, substeps=1, threads=1)
         if slow:
             d.kernel = NumpyKernel(ocp)
         work = Work(d, ocp.initial_states.sample(B, 0), np.zeros(B), u, None, None)
@@ -68,12 +68,12 @@ def test_it_is_chosen_by_itself_and_said_once(monkeypatch):
     ocp = nocl.load_ocp("pendulum")
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
-        solvers = [DDP(ocp, intervals=10) for _ in range(2)]
+        solvers = [DDP(ocp, intervals=10, substeps=1) for _ in range(2)]
     assert all(isinstance(d.kernel, NumpyKernel) for d in solvers)
     assert [str(w.message)[:19] for w in said] == ["no C compiler found"]
-    solution = solvers[0].solve([[1.0, 0.0], [1e200, 0.0]])
+    solution = solvers[0].solve([[1.0, 0.0], [1e140, 0.0]])
     assert solution.success.tolist() == [True, False]
-    assert "blows up" in solution.message[1]
+    assert "no descent" in solution.message[1]
     assert len(solvers[0].solve(np.zeros((0, 2)))) == 0
 
 

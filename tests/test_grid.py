@@ -1,16 +1,21 @@
 """Steps that are too long for a plant: found, told, and cured by substeps, which all solvers share."""
 
 import warnings
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
 import pytest
+import torch
 
 import nocl
 from nocl.solvers import DDP, NMPC
-from nocl.solvers.cnd.training import substeps_for
+from nocl.solvers.ddp.solver import substeps_for
 from nocl.solvers.ddp.without_compiler import NumpyKernel
-from nocl.solvers.grid import COARSE, TRIED, WANTED, measured
+from nocl.solvers.grid import measured
+from nocl.solvers.nmpc.solver import shared_program
+from nocl.substeps import COARSE, FINE, TRIED, WANTED
+from nocl.sysid.settings import LogSettings
 from nocl.systems import NAMES
 
 X0 = np.array([1.0, 0.0])
@@ -72,11 +77,47 @@ def test_a_grid_that_is_too_coarse_is_told_by_both_solvers_and_what_helps_helps(
         judged = nocl.simulate(ocp, fine.u, X0).cost[0]
         assert fine.cost[0] == pytest.approx(judged, rel=1e-3)
         assert judged == pytest.approx({54.0: 0.02523, 60.0: 0.02522, 150.0: 0.02519}[rate], rel=1e-3)
-    assert substeps_for(ocp, None, 80) >= grid.needed
+    chosen = substeps_for(ocp, None, 80, FINE)
+    assert measured(ocp, ocp.functions, fine, chosen).error <= FINE
+
+
+@pytest.mark.parametrize("rate", [60.0, 1000.0])
+@pytest.mark.parametrize("make", [lambda ocp: DDP(ocp), lambda ocp: NMPC(ocp, 80, starts=2, passes=0)])
+def test_left_to_themselves_solvers_take_as_many_as_the_plant_asks_for(make, rate, tmp_path):
+    ocp = lag(rate)
+    shared_program.cache_clear()  # NMPC says it once for each program
+    with pytest.warns(UserWarning, match=r"too coarse .* so they are taken|nothing was solved; \d+ are taken"):
+        found = make(ocp).solve(X0)
+    judged = nocl.simulate(ocp, found.u, X0).cost[0]
+    assert found.cost[0] == pytest.approx(judged, rel=1e-3)
+    assert judged == pytest.approx({60.0: 0.02522, 1000.0: 0.025187}[rate], rel=1e-3)
+    with warnings.catch_warnings():  # remembered, and resumed from a folder
+        warnings.simplefilter("error")
+        again = make(ocp).solve(X0 + 0.01)
+    assert nocl.simulate(ocp, again.u, X0 + 0.01).cost[0] == pytest.approx(again.cost[0], rel=1e-3)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        kept = [make(lag(rate)).solve(X0, out=tmp_path) for _ in range(2)]
+    assert kept[0].cost == kept[1].cost == pytest.approx(found.cost, rel=1e-6)
+
+
+def test_nmpc_tells_its_program_with_the_substeps_that_were_chosen():
+    shared_program.cache_clear()
+    nmpc = NMPC(lag(60.0), 40, starts=1, passes=0)
+    assert nmpc.settled.substeps == 1
+    with pytest.warns(UserWarning, match="so they are taken"):
+        found = nmpc.solve(X0, gains=True, workers=1)
+    assert nmpc.settled.substeps == nmpc.program.substeps > 1
+    assert np.isfinite(found.gain).all()
+    x, cost = X0, 0.0
+    for k in range(40):
+        x, part = (v.full().ravel() for v in nmpc.program.step(x, found.u[0, k], 0.1))
+        cost += part[0]
+    assert found.cost[0] == pytest.approx(cost + 5 * x[0]**2 + x[1]**2, rel=1e-6)
 
 
 def test_it_is_told_once():
-    ddp = DDP(lag(60.0))
+    ddp = DDP(lag(60.0), substeps=1)
     with pytest.warns(UserWarning, match="substeps="):
         ddp.solve(X0)
     with warnings.catch_warnings():
@@ -96,5 +137,29 @@ def test_what_no_explicit_step_can_follow_is_said_to_be():
 @pytest.mark.parametrize("name", NAMES)
 def test_the_problems_that_come_with_nocl_need_one_step(name):
     ocp = nocl.load_ocp(name)
-    assert substeps_for(ocp, None, 80) == 1
-    assert WANTED < COARSE
+    assert substeps_for(ocp, None, 80, FINE) == 1
+    assert WANTED < FINE < COARSE
+
+
+@pytest.mark.slow
+def test_a_log_whose_samples_are_far_apart_is_fitted_by_shorter_steps():
+    """The actuator settles in 33 ms, a sample comes every 50 ms: one Runge-Kutta step is 6 % off."""
+    s, h, K = lag(30.0).system, 0.05, 40
+    step = ca.integrator("step", "cvodes", {"x": s.x, "p": s.u, "ode": s.xdot}, 0, h, {"reltol": 1e-10})
+    t, x, u = np.arange(K + 1) * h, np.zeros((3, K + 1, 2)), np.zeros((3, K + 1, 1))
+    for run in range(3):
+        u[run, :, 0] = 0.7 * np.sin(2 * t + run) + 0.3 * np.sin(9 * t - run)
+        for k in range(K):
+            x[run, k + 1] = step(x0=x[run, k], p=u[run, k])["xf"].full().ravel()
+    log = nocl.Log.of(s, np.tile(t, 3), x.reshape(-1, 2), u.reshape(-1, 1), run=np.repeat(np.arange(3), K + 1))
+    given = {"known": {"x": "z"}, "control_affine": True}
+    settings = LogSettings.of("quick", window=4, steps=25)
+    with pytest.warns(UserWarning, match="identify: the grid is too coarse .* so it is fitted again"):
+        model = nocl.identify(s, data=log, settings=settings, **given)
+    with pytest.warns(UserWarning, match=r"with substeps=\d"):
+        coarse = nocl.identify(s, data=log, settings=replace(settings, substeps=1), **given)
+    assert (model.card["substeps"], coarse.card["substeps"]) == (4, 1)
+    errors = [m.validate(log, (1,)).relative[0] for m in (model, coarse)]
+    assert errors[0] < 0.5 * errors[1]
+    at = torch.tensor([[0.0, 0.3]], dtype=torch.float64), torch.tensor([[0.0]], dtype=torch.float64)
+    assert model(*at)[0, 1].item() == pytest.approx(-9.0, rel=0.1)

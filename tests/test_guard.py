@@ -9,9 +9,11 @@ import threading
 import time
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 import pytest
 
+import nocl
 from nocl.solvers import NMPC
 from nocl.solvers.nmpc.solver import shared_program
 from nocl.solvers.nmpc.transcription import Transcription
@@ -109,6 +111,21 @@ def test_threads_get_their_own_answers():
     assert len(guard._COPIES) == 1  # those of the threads went with them
 
 
+def test_a_copy_that_inherits_a_locked_lock_is_made_anew():
+    """As a fork beside threads may, which catches one of them inside a library."""
+    lock = threading.Lock()
+
+    def locked(x):
+        with lock:
+            return 2 * x
+
+    lock.acquire()
+    timer = threading.Timer(0.3, lock.release)
+    timer.start()
+    assert Guarded(locked, lambda: locked(0))(60.0, 21) == 42
+    timer.join()
+
+
 @pytest.fixture
 def stuck_from(monkeypatch):
     """NMPC's fatrop sleeps where the guess begins beyond `limit` in the first state."""
@@ -136,6 +153,16 @@ def test_a_state_whose_solver_is_stuck_gets_ipopts_answer(stuck_from):
     assert solution.success.all()
     np.testing.assert_allclose(solution.cost, right.cost, rtol=1e-6)
     assert "by IPOPT after fatrop: fatrop was given up: it did not come back within 0.5 s" in solution.message[1]
+
+
+def test_an_error_of_the_library_fails_one_start_and_not_the_batch():
+    ocp = pendulum.ocp()
+    x0 = np.array([[3.0, 0.0], [0.0, 0.0]])
+    given = {"starts": 2, "passes": 0, "options": {"error_on_fail": True, "ipopt.max_iter": 12}}
+    solution = NMPC(ocp, 20, solver="ipopt", **given).solve(x0, workers=1)
+    assert solution.success.tolist() == [False, True]
+    assert "ipopt ended with an error: " in solution.message[0]
+    assert "another solver" in solution.message[0]
 
 
 def test_a_state_whose_solvers_are_stuck_fails_and_the_others_go_on(stuck_from):
@@ -172,3 +199,15 @@ def test_patience_grows_with_what_solves_take():
     assert program.patience >= 10.0
     program._took[0] = 7.0
     assert program.patience >= 140.0
+
+
+def test_a_cost_that_is_not_finite_is_not_solved():
+    """fatrop says "solved" where the cost is NaN on every way from the state."""
+    p, v, u = ca.SX.sym("p"), ca.SX.sym("v"), ca.SX.sym("u")
+    s = nocl.System("mass", x=ca.vertcat(p, v), u=u, xdot=ca.vertcat(v, u), lbu=[-1], ubu=[1], lbx=[-5, -5], ubx=[5, 5])
+    ocp = nocl.OCP(s, horizon=3.0, running=u**2 + ca.log(4 + p), terminal=p**2 + v**2, x_goal=[0, 0], u_goal=[0],
+                   initial_states=nocl.Gaussian([0.5, 0], [0.1, 0.1]))
+    found = NMPC(ocp, 20, starts=2, passes=0).solve([-4.5, -2.0], workers=1)
+    assert not found.success[0]
+    assert np.isinf(found.cost[0])
+    assert "not finite" in found.message[0] or "NaN" in found.message[0]

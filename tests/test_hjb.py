@@ -76,6 +76,7 @@ def test_residuals_vanish_on_the_riccati_solution(lq):
     assert hjb.hjb_residual(V, f, L, x, u + 0.3, t).min() > 8e-4  # L + V_x'f grows by R 0.3^2 = 9e-4 off the optimum
 
 
+@pytest.mark.slow
 def test_losses_vanish_and_the_cost_is_the_value_on_the_riccati_solution(lq):
     f, L, G, P, P_dot = lq
     x, _ = samples(8)

@@ -39,6 +39,21 @@ def test_control_has_the_same_dynamics_and_linearisation(ocp):
         nocl.to_control(s, x)
 
 
+def test_held_controls_are_held_by_control(ocp):
+    """Joined by lines they end 1.2 elsewhere."""
+    control = pytest.importorskip("control")
+    x, u = np.array([0.0, 0.0, np.pi, 0.0]), np.random.default_rng(0).uniform(-3, 3, (20, 1))
+    times, inputs = nocl.held_inputs(np.linspace(0, 4, 21), u)
+    response = control.input_output_response(nocl.to_control(ocp.system), times, inputs, x,
+                                             solve_ivp_kwargs={"max_step": 0.2, "rtol": 1e-8, "atol": 1e-10})
+    run = nocl.simulate(ocp, u[None], x)
+    np.testing.assert_allclose(response.states[:, -1], run.x[0, -1], rtol=0, atol=1e-4)
+    np.testing.assert_array_equal(inputs[0, ::2], inputs[0, 1::2])
+    for t, wrong in ((np.linspace(0, 4, 20), u), ([0.0, np.nan], u[:1]), ([1.0, 0.0], u[:1])):
+        with pytest.raises(ValueError, match="held_inputs"):
+            nocl.held_inputs(t, wrong)
+
+
 @pytest.mark.parametrize("problem", ["cartpole", "dubins"])
 @pytest.mark.parametrize("integrator", ["rk4", "cvodes"])
 def test_gymnasium_accepts_the_environment(problem, integrator):

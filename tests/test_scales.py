@@ -8,6 +8,9 @@ from hypothesis import strategies as st
 
 import nocl
 from nocl.solvers import DDP, LQR, NMPC
+from nocl.solvers.cnd.features import features
+from nocl.solvers.cnd.labels import Labels
+from nocl.solvers.ddp.global_search import equilibria, solve_globally
 
 X0 = np.array([1.5, -0.5])
 
@@ -62,3 +65,61 @@ def test_any_units(right, k, first, second, unit_u):
 def test_ordinary_problems_are_solved_as_they_stand():
     for name in ("pendulum", "cartpole", "acrobot", "dubins"):
         assert NMPC(nocl.load_ocp(name), 10).program.scales.ordinary
+
+
+def swing(k=1.0, unit_u=1.0, unit_x=1.0):
+    """A pendulum that has to be swung up: DDP damps its way there."""
+    theta, omega, u = ca.SX.sym("theta"), ca.SX.sym("omega"), ca.SX.sym("u")
+    T, W, U = unit_x * theta, unit_x * omega, unit_u * u
+    system = nocl.System("swing", x=ca.vertcat(theta, omega), u=u, xdot=ca.vertcat(W, 9.81 * ca.sin(T) + U) / unit_x,
+                         lbu=[-5 / unit_u], ubu=[5 / unit_u], lbx=np.array([-6.5, -8.0]) / unit_x,
+                         ubx=np.array([6.5, 8.0]) / unit_x)
+    return nocl.OCP(system, horizon=3.0, running=k * 0.01 * U**2, terminal=k * (T**2 + W**2), x_goal=[0, 0], u_goal=[0],
+                    initial_states=nocl.Gaussian(mean=np.array([3.0, 0.0]) / unit_x, std=np.full(2, 0.1) / unit_x))
+
+
+@pytest.mark.parametrize(("k", "unit_u", "unit_x"), [
+    (2.0**-30, 1.0, 1.0), (2.0**30, 1.0, 1.0), (1.0, 2.0**30, 1.0), (1.0, 2.0**-30, 1.0), (1.0, 1.0, 2.0**-30),
+    (2.0**40, 2.0**-20, 2.0**20)])
+def test_ddp_takes_the_same_steps_in_other_units(k, unit_u, unit_x):
+    """Units that are powers of 1024 change no digit: damping, line searches and stopping rules must not either."""
+    x0 = np.random.default_rng(0).normal([3.0, 0.0], [0.5, 1.0], (12, 2))
+    plain, other = (DDP(ocp, intervals=40).solve(x0 / unit) for ocp, unit in ((swing(), 1.0),
+                                                                            (swing(k, unit_u, unit_x), unit_x)))
+    np.testing.assert_array_equal(other.iterations, plain.iterations)
+    np.testing.assert_array_equal(other.success, plain.success)
+    np.testing.assert_array_equal(other.cost / k, plain.cost)
+    np.testing.assert_array_equal(other.u * unit_u, plain.u)
+    assert plain.success.sum() > 6
+    assert plain.iterations.max() > 15
+
+
+def test_what_counts_as_the_same_cost_does_not_depend_on_its_unit():
+    x0 = np.random.default_rng(0).normal([3.0, 0.0], [0.5, 1.0], (6, 2))
+    found = [solve_globally(DDP(swing(k), intervals=30), x0, starts=6, rounds=1, seed=0) for k in (1.0, 2.0**-40)]
+    np.testing.assert_array_equal(found[1].hits, found[0].hits)
+    assert [len(o) for o in found[1].optima] == [len(o) for o in found[0].optima]
+    assert max(len(o) for o in found[0].optima) > 1
+
+
+@given(first=power, second=power)
+@settings(max_examples=5, deadline=None, derandomize=True)
+def test_features_do_not_depend_on_units(first, second):
+    unit, rng = np.array([first, second]), np.random.default_rng(0)
+    x, t = rng.normal(X0, [0.5, 0.5], (500, 2)), rng.uniform(0, 4, 500)
+    def values(ocp, x):
+        labels = Labels(x, t, np.zeros((500, 0)), np.zeros((500, 1)), np.ones(500), np.zeros(500))
+        return features(ocp, labels, plain=True)(x.T, t[None]).full()
+
+    right, got = values(problem(), x), values(problem(1.0, unit), x / unit)
+    np.testing.assert_allclose(got, right, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e9])
+def test_equilibria_are_found_in_any_unit(scale):
+    def of(unit):
+        found = equilibria(problem(1.0, (unit, unit)), 32, np.random.default_rng(1))
+        return {tuple(np.round(z, 6) + 0.0) for z in found * [unit, unit, 1.0]}
+
+    assert of(scale) == of(1.0)
+    assert len(of(1.0)) > 1

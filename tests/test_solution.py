@@ -108,7 +108,7 @@ def test_starts_hits_and_optima_are_read_from_what_was_tried():
     alone = DDP(problem(), intervals=10, threads=1).solve(problem().initial_states.sample(2, 0))
     assert alone.starts.tolist() == [1, 1]
     assert alone.hits.tolist() == [1, 1]
-    assert distinct(np.array([np.nan, np.inf])).shape == (0, 2)
+    assert distinct(np.array([np.nan, np.inf]), 1.0).shape == (0, 2)
 
 
 def test_seconds_and_iterations_are_of_all_that_was_tried():

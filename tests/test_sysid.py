@@ -291,8 +291,8 @@ def test_data_that_cannot_be_used():
     good = Dataset.sample(system, 20)
     bad = good.xdot.copy()
     bad[7, 1] = np.nan
-    cases = {r"xdot\[7\]": {"xdot": bad}, "data.u has shape": {"u": good.u[:-1]}, "both or neither": {"A": None},
-             "data.A has shape": {"A": good.B}}
+    cases = {r"xdot\[7, 1\]": {"xdot": bad}, "u has shape": {"u": good.u[:-1]}, "both or neither": {"A": None},
+             "A has shape": {"A": good.B}}
     for match, change in cases.items():
         with pytest.raises(ValueError, match=match):
             identify(system, data=dataclasses.replace(good, **change), progress=False)

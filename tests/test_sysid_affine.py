@@ -205,6 +205,7 @@ def test_what_is_affine_is_found():
     assert float(slope_in_u(found, 0.0)[0]) == pytest.approx(2.0, abs=1e-9)  # read off, not learned
 
 
+@pytest.mark.slow
 def test_what_is_not_affine_is_not():
     data = both(plant(0.3), 60)[0]
     model = identify(plant(0.3), data=data, settings=SMALL, progress=False)

@@ -142,7 +142,7 @@ XBOX = {"x": (-1.0, 1.0)}
     (policy(), {"bounds": BOUNDS | {"x": ([0, 0], [1, 1])}}, r"shape \(2,\), expected \(3,\)"),
     (shaped(ca.log(X), X), {"bounds": XBOX}, r"NaN or inf at \[-1"),
     (policy(), {"bounds": BOUNDS, "labels": {"x": ["p"]}}, "labels has 1 texts for x, expected 3"),
-    (policy(), {"bounds": BOUNDS, "dtype": "float16"}, "expected one of float64, float32"),
+    (policy(), {"bounds": BOUNDS, "dtype": "float16"}, "expected 'float64' or 'float32'"),
     (policy(), {"bounds": BOUNDS, "name": "while"}, "no name for C"),
     (policy(), {"bounds": BOUNDS, "name": "1st"}, "no name for C"),
     (shaped(X @ X.T, X), {"bounds": XBOX}, "expected a dense column"),

@@ -183,7 +183,7 @@ def with_nan() -> nn.Module:
     (nn.Linear(2, 1), {"n_in": 0}, "n_in is 0"),
     (nn.Tanh(), {}, "pass n_in"),
     (nn.LayerNorm((2, 3)), {}, "expected one dimension"),
-    (MLP([2, 1]), {"backend": "onnx"}, "expected one of native, l4casadi"),
+    (MLP([2, 1]), {"backend": "onnx"}, "expected 'native' or 'l4casadi'"),
     (MLP([2, 1]), {"build_dir": "x"}, "leave it out"),
     (MLP([2, 1]), {"in_names": ["x", "t"]}, "in_names has 2 names"),
     (MLP([2, 1]), {"name": "not a name"}, "expected plain identifiers"),
@@ -277,3 +277,17 @@ def test_l4casadi_dynamics_work_inside_an_rk4_nlp_with_exact_hessians(tmp_path):
         solutions.append((float(result["f"]), result["x"].full().ravel()))
     assert solutions[1][0] == pytest.approx(solutions[0][0], rel=1e-5)
     np.testing.assert_allclose(solutions[1][1], solutions[0][1], atol=1e-3)
+
+
+@pytest.mark.parametrize("layer", [nn.Sigmoid(), nn.SiLU()])
+def test_sigmoids_keep_their_digits_far_below_zero(layer):
+    """0.5 (1 + tanh(x / 2)) is 0 below -37; at 0 the branches meet, with all their derivatives."""
+    x = np.array([-745.0, -300.0, -50.0, -37.5, -20.0, -1.0, 0.0, 1.0, 37.5, 300.0])
+    right = np.exp(np.minimum(x, 0)) / (1 + np.exp(-np.abs(x))) * (x if isinstance(layer, nn.SiLU) else 1)
+    f = to_casadi(nn.Sequential(layer), 1, in_names=["x"], out_names=["y"])
+    np.testing.assert_allclose([float(f(v)) for v in x], right, rtol=1e-14)
+    at = torch.tensor([[0.0]], dtype=torch.float64, requires_grad=True)
+    slope = torch.autograd.grad(layer(at).sum(), at)[0].item()
+    jacobian = f.factory("slope", ["x"], ["jac:y:x"])
+    assert float(jacobian(0.0)) == pytest.approx(slope, rel=1e-14)
+    assert np.isfinite([float(jacobian(v)) for v in x]).all()

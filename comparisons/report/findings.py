@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from nocl.support.checks import Array
 
-COST_FLOOR = 1e-8  # gaps are relative to max(|best cost|, this): costs below it are the judge's rounding
+FLOOR = 1e-8  # of the usual cost: costs below it are the judge's rounding
 LEVELS = (5, 25, 50, 75, 95)  # percentiles that distributions are summed up by
 Row = dict[str, Any]
 
@@ -20,6 +20,15 @@ Row = dict[str, Any]
 def percentile(values: Array, q: float) -> float:
     """The q-th percentile; where some are inf (failures) the nearest value above, since inf cannot be interpolated."""
     return float(np.percentile(values, q, method="linear" if np.isfinite(values).all() else "higher"))
+
+
+def per_cent(excess: Array, of: Array, usual: float | None = None) -> Array:
+    """100 excess / |of|, of costs; where those are less than FLOOR of the `usual` cost (default: the largest), of that.
+    """
+    size = np.abs(of)
+    most = float(size[np.isfinite(size)].max(initial=0.0)) if usual is None else usual
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(100 * excess / np.maximum(size, FLOOR * most))
 
 
 def quantiles(values: Array) -> dict[str, float]:
@@ -120,7 +129,7 @@ class ScenarioLoss:
     def lost(self) -> Array:
         """[B], 100 (cost - best) / |best|; inf where it failed, NaN where no optimum is known."""
         with np.errstate(invalid="ignore"):
-            lost = 100 * (self.cost - self.best) / np.maximum(np.abs(self.best), COST_FLOOR)
+            lost = per_cent(self.cost - self.best, self.best)
         return np.where(np.isfinite(self.best), np.where(self.success, lost, np.inf), np.nan)
 
     def summary(self) -> Row:

@@ -14,17 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nocl.comparisons.report.findings import (
-    COST_FLOOR,
     MethodAudit,
     Promise,
     Region,
     Robustness,
     Row,
     Stability,
+    per_cent,
     percentile,
 )
 from nocl.judge import Simulation
 from nocl.ocp import OCP
+from nocl.scales import usual_sizes
 from nocl.support.checks import Array
 
 REFERENCE = "reference"  # the name of a yardstick among the methods: its speed is no method's
@@ -125,8 +126,8 @@ class Results:
 
     @cached_property
     def gap(self) -> Array:
-        """[methods, B], 100 (cost - best) / max(|best|, COST_FLOOR); inf where a run failed or nobody has a best."""
-        gap = 100 * (self.cost - self.best) / np.maximum(np.abs(self.best), COST_FLOOR)
+        """[methods, B], cost - best in per cent of |best|; inf where a run failed or nobody has a best."""
+        gap = per_cent(self.cost - self.best, self.best, usual_sizes(self.ocp).cost)
         return np.where(np.isnan(gap), np.inf, gap)
 
     def within(self, percent: float) -> Mask:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from nocl.comparisons.report.findings import per_cent
 from nocl.comparisons.report.results import (
-    COST_FLOOR,
     REFERENCE,
     Judged,
     Results,
@@ -45,8 +45,8 @@ def _without_feedback(judged: Judged) -> list[str]:
     """Plans that cost more than they predict, in the median: without feedback errors grow, most where f is unstable."""
     known = np.asarray(judged.simulation.success, dtype=bool) & np.isfinite(judged.predicted)
     cost, predicted = judged.simulation.cost[known], judged.predicted[known]
-    excess = (cost - predicted) / np.maximum(np.abs(predicted), COST_FLOOR)
-    if judged.plan is None or not known.any() or np.median(excess) <= UNSTABLE:
+    excess = per_cent(cost - predicted, predicted)
+    if judged.plan is None or not known.any() or np.median(excess) <= 100 * UNSTABLE:
         return []
     return [f"{judged.name}'s plans predict a cost of {number(mean(predicted))} on average; run open loop on the "
             f"exact f they cost {number(mean(cost))}: what is missing there is feedback, or a finer grid or model, "

@@ -19,7 +19,8 @@ from nocl.exports.casadi_forms import to_casadi
 from nocl.exports.onnx_reader import from_onnx
 from nocl.exports.onnx_writer import Session, to_onnx
 from nocl.exports.parity import Certificate, ExportPart, Finding
-from nocl.support import compiler, store
+from nocl.support import checks, compiler, store
+from nocl.support.atomic import part_of, remove_parts
 from nocl.support.checks import Array
 from nocl.system import System
 
@@ -64,10 +65,10 @@ def export(thing: Any, folder: str | os.PathLike[str], to: Sequence[str] = ("cas
     Returns the Certificate; str() of it is one line. All or nothing: where a limit is passed (float64 1e-12, float32
     1e-5, see nocl.exports.parity) it raises ValueError, and the folder is as it was.
     """
-    folder = Path(os.path.abspath(folder))
-    for form in (*to, *(against or ())):
-        if form not in FORMS:
-            raise ValueError(f"export: the form is {form!r}; expected some of {', '.join(FORMS)}")
+    folder = Path(os.path.abspath(checks.folder(folder, "folder", "export")))
+    for form in (*checks.words(to, "to", "export"), *(() if against is None else checks.words(against, "against",
+                                                                                               "export"))):
+        checks.word(form, FORMS, "the form", "export")
     missing = missing_backends()
     for form in to:
         if form in missing:
@@ -75,7 +76,7 @@ def export(thing: Any, folder: str | os.PathLike[str], to: Sequence[str] = ("cas
     parts, there, new, lib = parts_of(thing), folder.exists(), _folder(folder), folder / "l4casadi" / "lib"
     before = set(lib.glob("*"))
     try:
-        with tempfile.TemporaryDirectory(prefix="nocl_export_") as scratch:
+        with tempfile.TemporaryDirectory(dir=compiler.own_folder()) as scratch:
             certificate = _Export(parts, new, lib, Path(scratch), _title(thing)).run(to, against, missing)
         store.write_json(new / PROOF, certificate.to_data())
         _merge(new, folder)
@@ -115,7 +116,10 @@ def _folder(folder: Path) -> Path:
     """An empty folder beside `folder`."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        return Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        remove_parts(folder.parent, folder.name)
+        part = part_of(folder)
+        part.mkdir()
+        return part
     except OSError as error:
         raise ValueError(f"export: {folder} cannot be made ({error.strerror}): name another folder") from error
 

@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nocl.support import checks, compiler
+from nocl.support.atomic import part_of, remove_parts
 from nocl.support.checks import Array
 
 MARK = "written by nocl.to_c"  # stands in the first line of every file: only such files are overwritten
@@ -90,8 +91,7 @@ def to_c(function: ca.Function, folder: str | Path, name: str | None = None, *, 
     """
     name = name or function.name()
     inputs, outputs = _arguments(function, name, bounds, labels or {})
-    if dtype not in REAL:
-        raise ValueError(f"to_c: dtype is {dtype!r}; expected one of {', '.join(REAL)}")
+    checks.word(dtype, tuple(REAL), "dtype", "to_c")
     code, sizes = _generate(function, f"{name}_casadi", REAL[dtype])
     z = _samples([a.box for a in inputs if a.box], samples, seed)
     values = np.hstack([v.full().T for v in _inner(function, name).map(len(z)).call(_split(z, inputs))])
@@ -247,7 +247,7 @@ def _generate(function: ca.Function, name: str, real: str) -> tuple[str, dict[st
             raise ValueError(f"to_c: {function.name()} calls the library of {part.name()}, which has no C source; "
                              "expected CasADi expressions: export the network with backend='native'")
     options: dict[str, Any] = {"with_header": True, "casadi_int": "int", "casadi_real": real, "verbose": False}
-    with tempfile.TemporaryDirectory() as folder:
+    with tempfile.TemporaryDirectory(dir=compiler.own_folder()) as folder:
         try:
             generator = ca.CodeGenerator(f"{name}.c", options)
             generator.add(_inner(function, name))
@@ -450,9 +450,12 @@ def _put(folder: Path, files: Mapping[str, str]) -> Path:
                              "folder")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        part = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        remove_parts(folder.parent, folder.name)
+        part = part_of(folder)
+        part.mkdir()
     except OSError as error:
-        raise ValueError(f"to_c: {folder} cannot be made ({error.strerror}): name another folder") from error
+        raise ValueError(f"to_c: {folder} cannot be made ({error.strerror}); expected a folder that can be written: "
+                         "name another folder") from error
     try:
         for file, text in files.items():
             (part / file).write_text(text, encoding="utf-8")

@@ -17,7 +17,10 @@ import torch
 from torch import Tensor, nn
 
 from nocl.exports import l4casadi_forms
+from nocl.exports.onnx_operations.arithmetic import sigmoid
 from nocl.nets import MLP, FeatureNet, Sine
+from nocl.support import checks
+from nocl.support.checks import LARGEST
 
 BACKENDS = ("native", "l4casadi")
 Names = Sequence[str]
@@ -51,14 +54,13 @@ def to_casadi(module: nn.Module, n_in: int | Sequence[int] | None = None, *, bac
     """
     if not isinstance(module, nn.Module):
         raise ValueError(f"to_casadi: got a {type(module).__name__}, expected a torch.nn.Module")
-    if backend not in BACKENDS:
-        raise ValueError(f"to_casadi: backend is {backend!r}; expected one of {', '.join(BACKENDS)}")
+    checks.word(backend, BACKENDS, "backend", "to_casadi")
     if backend == "native" and build_dir is not None:
-        raise ValueError("to_casadi: build_dir is for backend='l4casadi'; the native backend builds nothing: "
-                         "leave it out")
+        raise ValueError("to_casadi: build_dir is for backend='l4casadi'; the native backend builds nothing, "
+                         "expected None: leave it out")
     _check_parameters(module)
     sizes, ins, outs = _signature(module, n_in, in_names, out_names)
-    name = name or type(module).__name__.lower()
+    name = type(module).__name__.lower() if name is None else checks.words([name], "name", "to_casadi", 1)[0]
     if backend == "native":
         args = [ca.MX.sym(i, n) for i, n in zip(ins, sizes, strict=True)]
         results = _feature_net(module, args) if type(module) is FeatureNet else _plain(module, args)
@@ -84,6 +86,9 @@ def _check_parameters(module: nn.Module) -> None:
 def _signature(module: nn.Module, n_in: int | Sequence[int] | None, in_names: Names | None,
                out_names: Names | None) -> tuple[list[int], Names, Names]:
     """The lengths of the inputs, and the names of inputs and outputs."""
+    for what, names in (("in_names", in_names), ("out_names", out_names)):
+        if names is not None:
+            checks.words(names, what, "to_casadi")
     if isinstance(module, FeatureNet):
         maps = module.inputs, module.outputs
         sizes = [maps[0].size1_in(i) for i in range(maps[0].n_in())]
@@ -102,10 +107,10 @@ def _signature(module: nn.Module, n_in: int | Sequence[int] | None, in_names: Na
 
 
 def _sizes(n_in: int | Sequence[int]) -> list[int]:
-    sizes = [n_in] if isinstance(n_in, int) else list(n_in)
-    if not sizes or any(isinstance(n, bool) or not isinstance(n, int) or n < 1 for n in sizes):
-        raise ValueError(f"to_casadi: n_in is {n_in!r}; expected the length of the input, or one of each input, as in "
-                         "(4, 1)")
+    sizes: list[Any] = list(n_in) if isinstance(n_in, (list, tuple)) else [n_in]
+    if not sizes or any(isinstance(n, bool) or not isinstance(n, int) or not 1 <= n <= LARGEST for n in sizes):
+        raise ValueError(f"to_casadi: n_in is {checks.shown(n_in)}; expected the length of the input, or one of each "
+                         "input, as in (4, 1)")
     return sizes
 
 
@@ -213,10 +218,6 @@ def _gelu(layer: nn.GELU, x: ca.MX, place: str) -> ca.MX:
 
 def _elu(layer: nn.ELU, x: ca.MX, place: str) -> ca.MX:
     return ca.if_else(x > 0, x, layer.alpha * ca.expm1(ca.if_else(x > 0, 0, x)))
-
-
-def sigmoid(x: ca.MX) -> ca.MX:
-    return 0.5 * (1 + ca.tanh(x / 2))  # exp(-x) overflows in the derivative
 
 
 RULES: dict[type[nn.Module], Rule] = {

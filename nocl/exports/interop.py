@@ -15,9 +15,14 @@ from nocl.support.checks import Array
 from nocl.support.packages import package
 from nocl.system import System
 
+EDGE = 1e-9  # of an interval: how long a held control takes to become the next
+
 
 def to_control(system: System, x: ArrayLike | None = None, u: ArrayLike | None = None) -> Any:
-    """python-control's NonlinearIOSystem: inputs u (not clipped to U), outputs x; with (x, u) the StateSpace there."""
+    """python-control's NonlinearIOSystem: inputs u (not clipped to U), outputs x; with (x, u) the StateSpace there.
+
+    Held controls, such as NMPC's, go through `held_inputs`.
+    """
     system.refuse_parameters("to_control")
     if (x is None) != (u is None):
         raise ValueError(f"to_control({system.name}): got one of x and u; expected both, or neither")
@@ -30,6 +35,23 @@ def to_control(system: System, x: ArrayLike | None = None, u: ArrayLike | None =
 
     return control.NonlinearIOSystem(update, None, inputs=list(system.control_names), outputs=list(system.state_names),
                                      states=list(system.state_names), name=system.name)
+
+
+def held_inputs(t: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
+    """(T [2 K], U [nu, 2 K]) of controls u [K, nu] held between times t [K+1], for python-control.
+
+    Its input_output_response joins samples by straight lines: here each control has one at either end of its interval.
+    Give solve_ivp_kwargs={"max_step": the shortest interval, "rtol": 1e-8} too, or its steps may pass over intervals.
+    """
+    times, controls = checks.real(t), checks.real(u)
+    if times.ndim != 1 or controls.ndim != 2 or len(times) != len(controls) + 1 or len(times) < 2:
+        raise ValueError(f"held_inputs: t has shape {times.shape}, u {controls.shape}; expected [K+1] and [K, nu]: "
+                         "of a Solution s row 0 is held_inputs(s.t[0], s.u[0])")
+    if not (np.isfinite(times).all() and np.isfinite(controls).all() and (np.diff(times) > 0).all()):
+        raise ValueError("held_inputs: expected finite numbers, and times that rise: leave out rows without a solution")
+    ends = times[1:] - EDGE * np.diff(times)
+    ends[-1] = times[-1]
+    return np.c_[times[:-1], ends].ravel(), np.repeat(controls, 2, axis=0).T
 
 
 def _statespace(system: System, x: ArrayLike, u: ArrayLike) -> Any:

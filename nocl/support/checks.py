@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import math
 import numbers
+import os
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -13,17 +16,25 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 MALFORMED = (KeyError, IndexError, TypeError, AttributeError, NotImplementedError, RuntimeError, RecursionError,
              OverflowError, MemoryError)  # what data of another form than expected raises on its way through a reader
+LARGEST = 10**9  # whole number that counts something: more is a mistake, and does not fit into memory
+ORDINARY = 1e150  # squares of larger numbers overflow
+PUBLIC = ("System", "OCP", "Dataset", "Log")  # kinds that are known by nocl's name
 Vector = Any  # a field that takes what a user writes (a list, an array) and holds a read-only Array
 
 
-def real(value: ArrayLike) -> Array:
-    """`value` as a new float64 array; ValueError, saying why, for what numpy would turn into numbers without a word."""
+def real(value: ArrayLike, copy: bool = True) -> Array:
+    """`value` as a float64 array, a new one where `copy`.
+
+    Raises ValueError, saying why, for what numpy would turn into numbers without a word.
+    """
+    if isinstance(value, (bytes, bytearray, memoryview)):  # of a bytearray numpy takes the codes of its letters
+        raise ValueError("holds bytes, not numbers: convert it")
     array = value if isinstance(value, np.ndarray) else np.asarray(value)
     if isinstance(value, np.ma.MaskedArray):
         raise ValueError("is a masked array, whose masked entries would count: fill or drop them")
     if array.dtype.kind not in "iuf" and not (array.dtype.kind == "O" and all(map(_is_real, array.flat))):
         raise ValueError(f"holds {_kind(array)}, not numbers: convert it")
-    return np.array(array, dtype=np.float64)
+    return np.array(array, dtype=np.float64, copy=copy or None)
 
 
 def _is_real(value: Any) -> bool:
@@ -43,13 +54,33 @@ def shown(value: Any, most: int = 120) -> str:
     return text if len(text) <= most else f"{text[:most]} ..."
 
 
+def numeric(value: ArrayLike, name: str, owner: str, expected: str, copy: bool = True) -> Array:
+    """`value` as a float64 array of any shape; ValueError, with what was expected, where it is none."""
+    if hasattr(value, "columns") and hasattr(value, "dtypes"):  # which column is which is not for numpy to guess
+        raise ValueError(f"{owner}: {name} is a {type(value).__name__} with columns {shown(list(value.columns))}; "
+                         f"expected {expected}: pick the columns in order, table[[...]].to_numpy()")
+    try:
+        return real(value, copy)
+    except Exception as error:  # whatever its own conversion raises
+        raise ValueError(f"{owner}: {name} is {shown(value)}, which {_why(error)}; expected {expected}") from None
+
+
+def array(value: ArrayLike, shape: Sequence[int | None], name: str, owner: str) -> Array:
+    """Finite numbers of a shape, float64, not copied where they are; None: any length. ValueError otherwise."""
+    text = "[" + ", ".join("N" if n is None else str(n) for n in shape) + "]" if shape else "a number"
+    found = numeric(value, name, owner, f"finite numbers {text}" if shape else text, copy=False)
+    if len(found.shape) != len(shape) or any(n not in (None, m) for n, m in zip(shape, found.shape, strict=True)):
+        raise ValueError(f"{owner}: {name} has shape {found.shape}; expected {text}")
+    if not np.isfinite(found).all():
+        at = tuple(int(i) for i in np.argwhere(~np.isfinite(found))[0])
+        raise ValueError(f"{owner}: {name}{list(at) if at else ''} is {found[at]}; expected finite numbers: check how "
+                         "it was computed")
+    return found
+
+
 def vector(value: ArrayLike, n: int, name: str, owner: str) -> Array:
     """A read-only float64 vector of length n without NaN; raises ValueError otherwise."""
-    try:
-        array = real(value)
-    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
-        raise ValueError(f"{owner}: {name} is {shown(value)}, which {_why(error)}; expected {n} numbers: pass a list "
-                         "of floats") from None
+    array = numeric(value, name, owner, f"{n} numbers: pass a list of floats")
     if array.shape != (n,):
         raise ValueError(f"{owner}: {name} has shape {array.shape}, expected ({n},): pass one number per coordinate")
     if np.isnan(array).any():
@@ -60,11 +91,7 @@ def vector(value: ArrayLike, n: int, name: str, owner: str) -> Array:
 
 def weight(value: ArrayLike, n: int, name: str, owner: str) -> Array:
     """A weight of a quadratic cost as a symmetric positive semidefinite [n, n], from a number, diagonal or matrix."""
-    try:
-        array = real(value)
-    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
-        raise ValueError(f"{owner}: the weight {name} is {shown(value)}, which {_why(error)}; expected a number, "
-                         f"[{n}] or [{n}, {n}]") from None
+    array = numeric(value, f"the weight {name}", owner, f"a number, [{n}] or [{n}, {n}]")
     matrix = array * np.eye(n) if array.shape in ((), (n,)) else array
     if matrix.shape != (n, n):
         raise ValueError(f"{owner}: the weight {name} has shape {array.shape}; expected a number, [{n}] or [{n}, {n}]")
@@ -114,11 +141,103 @@ def column(value: Any) -> Any:
 
 def number(value: Any, name: str, owner: str, positive: bool = False) -> float:
     """A finite number >= 0 (> 0 where `positive`) as a float; raises ValueError otherwise."""
-    real = isinstance(value, numbers.Real) and not isinstance(value, bool)
-    if not real or not np.isfinite(value) or value < 0 or (positive and value == 0):
+    found = finite(value)
+    if found is None or found < 0 or (positive and found == 0):
         expected = "positive number" if positive else "number >= 0"
-        raise ValueError(f"{owner}: {name} is {value!r}; expected a finite {expected}")
-    return float(value)
+        raise ValueError(f"{owner}: {name} is {shown(value)}; expected a finite {expected}")
+    return found
+
+
+def finite(value: Any) -> float | None:
+    """A finite real number, also as a numpy scalar, as a float; None for anything else."""
+    if not _is_real(value):
+        return None
+    try:
+        found = float(value)
+    except (OverflowError, ValueError):
+        return None
+    return found if math.isfinite(found) else None
+
+
+def between(value: Any, low: float, high: float, name: str, owner: str, what: str = "") -> float:
+    """A number in [low, high] as a float; ValueError otherwise, where `what` says what the range is."""
+    found = finite(value)
+    if found is None or not low <= found <= high:
+        raise ValueError(f"{owner}: {name} is {shown(value)}; expected a number in [{low:g}, {high:g}]{what}")
+    return found
+
+
+def start_time(t0: Any, horizon: float, owner: str = "") -> float:
+    """A time at which a problem can start; ValueError otherwise."""
+    found = finite(t0)
+    if found is None or not 0 <= found < horizon:
+        raise ValueError(f"{owner}{': ' * bool(owner)}t0 is {shown(t0)}; expected 0 <= t0 < {horizon:g}, the horizon")
+    return found
+
+
+def whole(value: Any, name: str, owner: str, least: int = 0, most: int = LARGEST) -> int:
+    """A whole number from `least` to `most` as an int; ValueError otherwise."""
+    found = int(value) if isinstance(value, (int, np.integer)) and not isinstance(value, bool) else None
+    if found is None or not least <= found <= most:
+        limit = f", at most {most:g}" if found is not None and found > most else ""
+        raise ValueError(f"{owner}: {name} is {shown(value)}; expected an integer >= {least}{limit}")
+    return found
+
+
+def flag(value: Any, name: str, owner: str) -> bool:
+    """True or False; ValueError otherwise."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise ValueError(f"{owner}: {name} is {shown(value)}; expected True or False")
+    return bool(value)
+
+
+def word(value: Any, among: Sequence[str], name: str, owner: str) -> str:
+    """One of some words; ValueError otherwise."""
+    if not isinstance(value, str) or value not in among:
+        raise ValueError(f"{owner}: {name} is {shown(value)}; expected {_alternatives(among)}")
+    return value
+
+
+def _alternatives(among: Sequence[str]) -> str:
+    """'a', 'b' or 'c'."""
+    return " or ".join(filter(None, [", ".join(map(repr, among[:-1])), repr(among[-1])]))
+
+
+def words(value: Any, name: str, owner: str, n: int | None = None) -> list[str]:
+    """A list of texts, n of them where it is given; ValueError otherwise."""
+    listed = isinstance(value, (list, tuple)) and all(isinstance(v, str) for v in value)
+    if not listed or n not in (None, len(value)):
+        many = "names" if n is None else f"{n} names"
+        raise ValueError(f"{owner}: {name} is {shown(value)}; expected a list of {many}")
+    return list(value)
+
+
+def folder(value: Any, name: str, owner: str) -> Path:
+    """A path; ValueError for what names no file or folder."""
+    if not isinstance(value, (str, os.PathLike)) or not os.fspath(value) or "\0" in os.fsdecode(value):
+        raise ValueError(f"{owner}: {name} is {shown(value)}; expected a path: pass a str or a pathlib.Path")
+    try:
+        Path(os.fsdecode(value)).exists()
+    except OSError as error:
+        raise ValueError(f"{owner}: {name} is {shown(value)}, {error.strerror}; expected a path of this machine"
+                         ) from None
+    return Path(os.fsdecode(value))
+
+
+def instance(kind: type, value: Any, name: str, owner: str, remedy: str = "") -> Any:
+    """`value`, where it is a `kind`; ValueError otherwise."""
+    if not isinstance(value, kind):
+        called = f"nocl.{kind.__name__}" if kind.__name__ in PUBLIC else kind.__name__
+        raise ValueError(f"{owner}: {name} is a {type(value).__name__}; expected a {called}"
+                         f"{': ' * bool(remedy)}{remedy}")
+    return value
+
+
+def generator(seed: Any, owner: str) -> np.random.Generator:
+    """The random numbers of a seed, an integer >= 0; a Generator goes on where it is."""
+    if isinstance(seed, np.random.Generator):
+        return seed
+    return np.random.default_rng(whole(seed, "seed", owner, most=2**128))
 
 
 def symbols(value: Any, name: str, owner: str) -> list[ca.SX]:
@@ -183,19 +302,13 @@ def _why(error: Exception) -> str:
 
 def states(x: ArrayLike, nx: int, owner: str, name: str = "x0") -> tuple[Array, bool]:
     """States as float64 rows [B, nx], and whether a single [nx] was given; NaN and other shapes raise ValueError."""
-    if hasattr(x, "columns") and hasattr(x, "dtypes"):  # a table: which column is which is not for numpy to guess
-        raise ValueError(f"{name} is a {type(x).__name__} with columns {shown(list(x.columns))}; expected an array "
-                         f"[{nx}] or [B, {nx}]: pick the columns in {owner}'s order, table[[...]].to_numpy()")
-    try:
-        array = real(x)
-    except (TypeError, ValueError, OverflowError, RuntimeError) as error:
-        raise ValueError(f"{name} is {shown(x)}, which {_why(error)}; {owner} has nx = {nx}: pass numbers [nx] or "
-                         "[B, nx]") from None
+    array = numeric(x, name, owner, f"an array of nx = {nx} columns: pass numbers [{nx}] or [B, {nx}]")
     single = array.ndim == 1
     rows = array[None, :] if single else array
     if rows.ndim != 2 or rows.shape[1] != nx:
         raise ValueError(f"{name} has shape {array.shape}; {owner} has nx = {nx}: pass [{nx}] or [B, {nx}]")
-    if not np.isfinite(rows).all():
-        bad = int(np.flatnonzero(~np.isfinite(rows).all(axis=1))[0])
-        raise ValueError(f"{name}[{bad}] is {rows[bad].tolist()}; expected finite numbers: remove or repair that state")
+    if not (np.abs(rows) < ORDINARY).all():
+        bad = int(np.flatnonzero(~(np.abs(rows) < ORDINARY).all(axis=1))[0])
+        why = "numbers below 1e150, whose squares are finite" if np.isfinite(rows[bad]).all() else "finite numbers"
+        raise ValueError(f"{name}[{bad}] is {rows[bad].tolist()}; expected {why}: remove or repair that state")
     return rows, single

@@ -21,7 +21,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import IO, Any
 
-from nocl.support.atomic import write_bytes
+from nocl.support.atomic import HOST, lives, remove_parts, write_bytes
 from nocl.support.fingerprint import fingerprint, sha256
 
 CACHE_VARIABLE = "NOCL_CACHE"  # names a folder for libraries; without it they live as long as the process
@@ -82,7 +82,9 @@ def shared_library(kind: str, identity: Sequence[Any], build: Callable[[Path], P
         return found
     with tempfile.TemporaryDirectory(dir=own_folder()) as scratch:  # a kill while building leaves the cache as it was
         content = build(Path(scratch)).read_bytes()
-    return write_bytes(folder / _file(name, content), content, durable=False)
+    path = write_bytes(folder / _file(name, content), content, durable=False)
+    remove_parts(folder)
+    return path
 
 
 def cache_folder(named: str | os.PathLike[str] | None = None) -> Path:
@@ -148,7 +150,7 @@ def own_folder() -> Path:
 @lru_cache
 def _own_folder() -> tuple[tempfile.TemporaryDirectory[str], IO[bytes]]:
     remove_left()
-    folder = tempfile.TemporaryDirectory(prefix=OWN, ignore_cleanup_errors=True)
+    folder = tempfile.TemporaryDirectory(prefix=f"{OWN}{HOST}-{os.getpid()}-", ignore_cleanup_errors=True)
     part = Path(folder.name, "part")
     held = part.open("wb")  # kept open: the system lets the lock go when the process ends, whatever ends it
     fcntl.flock(held, fcntl.LOCK_EX)
@@ -164,3 +166,7 @@ def remove_left() -> None:
                 shutil.rmtree(lock.parent, ignore_errors=True)
         except OSError:  # its process lives, or it is another user's
             continue
+    for folder in Path(tempfile.gettempdir()).glob(f"{OWN}{HOST}-*-*"):  # a kill while it was made, or removed
+        process = folder.name.removeprefix(f"{OWN}{HOST}-").partition("-")[0]
+        if process.isdigit() and not lives(int(process)):
+            shutil.rmtree(folder, ignore_errors=True)

@@ -16,6 +16,9 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, ClassVar, Self
 
+from nocl.support import checks
+from nocl.support.checks import LARGEST
+
 RULE = "nocl rule"  # of a field's metadata
 EFFORTS = ("quick", "normal", "best")
 
@@ -40,7 +43,8 @@ class Checked:
                 continue
             value = getattr(self, f.name)
             if not rule.holds(value):
-                raise ValueError(f"{type(self).__name__}: {f.name} is {value!r}; expected {rule.expected} ({rule.doc})")
+                raise ValueError(f"{type(self).__name__}: {f.name} is {checks.shown(value)}; expected {rule.expected} "
+                                 f"({rule.doc})")
             object.__setattr__(self, f.name, rule.kept(value))
 
 
@@ -57,15 +61,12 @@ class Scaled(Checked):
 
 def checked_effort(effort: Any, owner: str) -> str:
     """An effort's word; ValueError for another."""
-    if effort not in EFFORTS:
-        raise ValueError(f"{owner}: effort is {effort!r}; expected {', '.join(map(repr, EFFORTS[:-1]))} or "
-                         f"{EFFORTS[-1]!r}")
-    return str(effort)
+    return checks.word(effort, EFFORTS, "effort", owner)
 
 
 def count(default: int | None, doc: str, *, least: int = 1, none: str = "") -> Any:
     """An integer >= least; with `none`, also None, which means that."""
-    return _field(default, doc, f"an integer >= {least}", lambda v: _is_whole(v) and v >= least, int, none)
+    return _field(default, doc, f"an integer >= {least}", lambda v: _is_whole(v) and least <= v <= LARGEST, int, none)
 
 
 def positive(default: float | None, doc: str, *, most: float = math.inf, none: str = "") -> Any:
@@ -123,4 +124,4 @@ def _is_whole(value: Any) -> bool:
 
 
 def _is_real(value: Any) -> bool:
-    return isinstance(value, numbers.Real) and not isinstance(value, bool) and math.isfinite(value)
+    return checks.finite(value) is not None

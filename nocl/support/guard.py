@@ -4,6 +4,10 @@ A library may loop for ever where none of its own limits reaches, and ignore Ctr
 process. The copy (a fork) has everything that was built here until then, so nothing is built or sent twice; it answers
 one call after the other, and is made anew after it was ended, or where something new is to be called. Each thread has
 its own.
+
+Where other threads are at work, a fork may catch one of them inside a library that holds a lock, which then stays
+locked in the copy for ever. So a new copy first rehearses what it is for; one that does not come back from that is
+ended, and another one made.
 """
 
 from __future__ import annotations
@@ -25,6 +29,7 @@ from typing import Any
 from weakref import WeakValueDictionary
 
 DEATH_SIGNAL = 1  # prctl's PR_SET_PDEATHSIG: what the copy gets when the thread that made it ends
+REHEARSALS = (1.0, 4.0, 16.0, 16.0, 16.0)  # seconds that a new copy has to rehearse, one after the other
 STANDARD = 3  # file descriptors of input, output and errors
 
 
@@ -33,17 +38,20 @@ class NoAnswerError(Exception):
 
 
 class Guarded:
-    """`function(*args)`, called in the copy; arguments and results pickle. What it needs is best built before."""
+    """`function(*args)`, called in the copy; arguments and results pickle. What it needs is best built before.
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self.function = function
+    rehearse : takes the locks that the function takes, in little time; it is called in each new copy
+    """
+
+    def __init__(self, function: Callable[..., Any], rehearse: Callable[[], Any] = lambda: None) -> None:
+        self.function, self.rehearse = function, rehearse
         with _LOCK:
             self.number = next(_NUMBERS)
             _FUNCTIONS[self.number] = self
 
     def __call__(self, limit: float, *args: Any) -> Any:
         """What the function returns or raises; NoAnswerError where it does not within `limit` seconds."""
-        return _copy_for(self.number).ask(limit, self.number, args)
+        return _copy_for(self.number).ask(limit, (self.number, args))
 
 
 class _Copy:
@@ -75,9 +83,9 @@ class _Copy:
         if pid:
             self.status = os.waitstatus_to_exitcode(status)
 
-    def ask(self, limit: float, number: int, args: tuple[Any, ...]) -> Any:
+    def ask(self, limit: float, call: Call) -> Any:
         try:
-            self.pipe.send((number, args))
+            self.pipe.send(call)
             if not self.pipe.poll(limit):
                 raise NoAnswerError(f"it did not come back within {limit:.3g} s")
             fine, answer = self.pipe.recv()
@@ -102,6 +110,7 @@ class _Copy:
         return signal.Signals(-status).name if status < 0 else f"exit code {status}"
 
 
+Call = tuple[int, tuple[Any, ...] | None]  # a function's number and its arguments; None: the rehearsal
 _NUMBERS = itertools.count()
 _FUNCTIONS: WeakValueDictionary[int, Guarded] = WeakValueDictionary()
 _LOCK = threading.Lock()
@@ -113,9 +122,22 @@ def _copy_for(number: int) -> _Copy:
     copy: _Copy | None = getattr(_OWN, "copy", None)
     if copy is None or not copy.knows(number):
         end()
-        copy = _OWN.copy = _Copy()
+        copy = _OWN.copy = _new_copy(number)
         _COPIES[:] = [c for c in _COPIES if c.owner == os.getpid() and c.lives()] + [copy]
     return copy
+
+
+def _new_copy(number: int) -> _Copy:
+    """A copy that has rehearsed the function of this number; NoAnswerError where none does."""
+    for limit in REHEARSALS:
+        copy = _Copy()
+        try:
+            copy.ask(limit, (number, None))
+        except NoAnswerError:
+            copy.end()
+        else:
+            return copy
+    raise NoAnswerError("no copy of this process can call it: its threads are too busy")
 
 
 @atexit.register
@@ -152,9 +174,10 @@ def _answer(pipe: Connection) -> None:
         os._exit(0)
 
 
-def _outcome(number: int, args: tuple[Any, ...]) -> tuple[bool, Any]:
+def _outcome(number: int, args: tuple[Any, ...] | None) -> tuple[bool, Any]:
     try:
-        return True, _FUNCTIONS[number].function(*args)
+        guarded = _FUNCTIONS[number]
+        return (True, guarded.function(*args)) if args is not None else (True, guarded.rehearse() and None)
     except Exception as error:
         return False, error
 

@@ -10,18 +10,27 @@ from types import FrameType
 
 
 @contextmanager
-def deferred() -> Iterator[None]:
-    """A Ctrl-C while it lasts is raised, as KeyboardInterrupt, at its end: keep it round one call of a solver.
+def kept() -> Iterator[None]:
+    """A Ctrl-C while it lasts ends the solver at once, and is raised at the end where the solver has swallowed it.
 
-    Only the main thread gets Ctrl-C, and only Python's handlers can be put aside: elsewhere this does nothing.
+    Keep it round one call of a solver. Only the main thread gets Ctrl-C, and only Python's handlers can be put aside:
+    elsewhere this does nothing.
     """
     if threading.current_thread() is not threading.main_thread() or not callable(signal.getsignal(signal.SIGINT)):
         yield
         return
     got: list[FrameType | None] = []
-    before = signal.signal(signal.SIGINT, lambda _, frame: got.append(frame))
+
+    def press(_: int, frame: FrameType | None) -> None:
+        got.append(frame)
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGINT, press)
     try:
         yield
+    except RuntimeError:  # what solvers make of it
+        if not got:
+            raise
     finally:
         signal.signal(signal.SIGINT, before)
     if got:

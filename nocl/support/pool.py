@@ -9,7 +9,10 @@ from __future__ import annotations
 import io
 import json
 import logging
+import os
 import pickle
+import signal
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -21,7 +24,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from nocl.support.atomic import write_bytes
+from nocl.support.atomic import remove_parts, write_bytes
+from nocl.support.checks import LARGEST, MALFORMED, shown
+from nocl.support.fingerprint import sha256
 from nocl.support.lock import alone
 
 Task = Any
@@ -33,6 +38,7 @@ WORTH = 4.0  # seconds that processes must save, by measurement
 CONNECT = 10.0  # seconds to wait for a scheduler, and for workers
 POLL = 0.02  # seconds between two looks at what is done
 LOOK = 1.0  # seconds between two looks at whether there still are workers
+DIGEST = 64  # characters of SHA-256 behind an outcome: a damaged one is found again, not used
 MANIFEST, TASKS = "manifest.json", "tasks"
 
 
@@ -50,9 +56,9 @@ class Pool:
 
     def __post_init__(self) -> None:
         w = self.workers
-        count = isinstance(w, (int, np.integer)) and not isinstance(w, bool) and w >= 1
+        count = isinstance(w, (int, np.integer)) and not isinstance(w, bool) and 1 <= w <= LARGEST
         if not count and not (isinstance(w, str) and (w == "auto" or "://" in w)):
-            raise ValueError(f"workers is {w!r}; expected a number >= 1, 'auto', or a Dask scheduler's 'tcp://...'")
+            raise ValueError(f"workers is {shown(w)}; expected a number >= 1, 'auto', or a Dask scheduler's 'tcp://...'")
 
     def outcomes(self, job: Any, tasks: Sequence[Task]) -> Iterator[Outcome]:
         """Each task's outcome once, in any order; `job(task)` does one, and pickles."""
@@ -101,7 +107,7 @@ def _in_processes(k: int, job: Any, tasks: Sequence[Task]) -> Iterator[Outcome]:
 
     data = pickle.dumps(job)
     work = Parallel(n_jobs=k, backend="loky", batch_size=1, pre_dispatch="2*n_jobs", return_as="generator_unordered")
-    for outcomes in work(delayed(_work)(data, chunk) for chunk in _chunks(tasks)):
+    for outcomes in work(delayed(_work)(data, chunk, os.getpid()) for chunk in _chunks(tasks)):
         yield from outcomes
 
 
@@ -188,7 +194,20 @@ def _job(data: bytes) -> Any:
     return pickle.loads(data)
 
 
-def _work(data: bytes, tasks: Sequence[Task]) -> list[Outcome]:
+@lru_cache(maxsize=1)
+def _end_with(parent: int) -> None:
+    """Ends this worker once its parent is gone: where that was killed, joblib's workers wait on for minutes."""
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(LOOK)
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _work(data: bytes, tasks: Sequence[Task], parent: int | None = None) -> list[Outcome]:
+    if parent is not None:
+        _end_with(parent)
     return [_job(data)(task) for task in tasks]
 
 
@@ -213,27 +232,38 @@ class Journal:
             return
         manifest = self.folder / MANIFEST
         if manifest.exists():
-            found = json.loads(manifest.read_text())
-            if found.get("key") != self.key:
+            if self._key_of(manifest) != self.key:
                 raise ValueError(f"{self.folder} holds another run of nocl (other states, problem, settings or "
                                  f"versions); expected the same one of {self.solver}, or a new folder: change `out`")
         elif self.folder.exists() and any(self.folder.iterdir()):
             raise ValueError(f"{self.folder} is not empty and holds no run of {self.solver}; expected a new folder: "
                              "change `out`")
         (self.folder / TASKS).mkdir(parents=True, exist_ok=True)
+        remove_parts(self.folder / TASKS)
         write_bytes(manifest, json.dumps({"kind": f"nocl {self.solver} run", "key": self.key}).encode())
+
+    def _key_of(self, manifest: Path) -> Any:
+        """What a manifest says of its run."""
+        try:
+            return json.loads(manifest.read_text(encoding="utf-8"))["key"]
+        except (OSError, ValueError, *MALFORMED) as error:
+            raise ValueError(f"{manifest} cannot be read ({type(error).__name__}: {error}); expected the manifest of a "
+                             f"run of {self.solver}, as nocl wrote it: name another folder, or empty this"
+                             ) from None
 
     def file(self, name: str) -> Path:
         assert self.folder is not None
         return self.folder / TASKS / f"{name}.npz"
 
-    def has(self, task: Task) -> bool:
-        """Whether its outcome was found before."""
-        return self.folder is not None and self.file(task.name).exists()
-
-    def read(self, task: Task) -> Outcome:
-        """What was found before."""
-        with np.load(self.file(task.name), allow_pickle=False) as data:
+    def read(self, task: Task) -> Outcome | None:
+        """What was found before; None where there is nothing, or not as it was written: it is to be done again."""
+        if self.folder is None or not self.file(task.name).is_file():
+            return None
+        content = self.file(task.name).read_bytes()
+        body, digest = content[:-DIGEST], content[-DIGEST:]
+        if sha256(body).encode() != digest:
+            return None
+        with np.load(io.BytesIO(body), allow_pickle=False) as data:
             return task.outcome({name: data[name] for name in data.files})
 
     def write(self, outcome: Outcome) -> None:
@@ -241,7 +271,8 @@ class Journal:
             return
         content = io.BytesIO()
         np.savez(content, **outcome.arrays())
-        write_bytes(self.file(outcome.name), content.getvalue(), durable=False)
+        body = content.getvalue()
+        write_bytes(self.file(outcome.name), body + sha256(body).encode(), durable=False)
 
 
 def stream(job: Any, tasks: Sequence[Task], pool: Pool, journal: Journal, show: bool, what: str) -> Iterator[Outcome]:
@@ -255,13 +286,13 @@ def stream(job: Any, tasks: Sequence[Task], pool: Pool, journal: Journal, show: 
 
 def _streamed(job: Any, tasks: Sequence[Task], pool: Pool, journal: Journal, show: bool,
               what: str) -> Iterator[Outcome]:
-    todo = [task for task in tasks if not journal.has(task)]
-    left = {task.name for task in todo}
+    known = {task.name for task in tasks if journal.read(task) is not None}
+    todo = [task for task in tasks if task.name not in known]
     total = sum(task.size for task in tasks)
     with tqdm(total=total, initial=total - sum(task.size for task in todo), desc=what, unit="state", delay=3.0,
               leave=False, disable=not show or len(todo) < 2) as bar:
         for task in tasks:
-            if task.name not in left:
+            if task.name in known:
                 yield journal.read(task)
         for outcome in pool.outcomes(job, todo):
             journal.write(outcome)

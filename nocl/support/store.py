@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -46,11 +48,23 @@ def load_checkpoint(path: str | Path) -> tuple[Any, dict[str, Any]]:
     if not path.is_file():
         raise ValueError(f"{path} does not exist; expected a checkpoint: start without resuming, or name its file")
     tensors, structure = read_tensors(path, "checkpoint")
-    try:
+    with reading(path, "a checkpoint"):
         return _unflatten(structure["tree"], tensors), structure["meta"]
+
+
+@contextmanager
+def reading(path: str | os.PathLike[str], what: str) -> Iterator[None]:
+    """A ValueError that names the file, for all that data of another form than expected raises inside."""
+    try:
+        yield
     except (*MALFORMED, ValueError) as error:
-        raise ValueError(f"{path}: {type(error).__name__} {error} in its structure; expected a checkpoint of nocl's: "
-                         "start without resuming") from error
+        said = str(error).strip().partition("\n")[0]  # CasADi lists all its overloads
+        if isinstance(error, ValueError) and str(path) in said:
+            raise
+        kind = "" if isinstance(error, (KeyError, ValueError)) else f"{type(error).__name__}: "
+        said += " is missing" if isinstance(error, KeyError) else ""
+        raise ValueError(f"{path}: {kind}{said}, in its structure; expected {what} that nocl wrote: save it again"
+                         ) from error
 
 
 def write_json(path: str | Path, data: Any) -> Path:

@@ -101,8 +101,9 @@ class Ensemble:
         card = store.read_json(Path(folder) / CARD)
         if not isinstance(card, dict) or not {"members", "usual"} <= card.keys():
             raise ValueError(f"{Path(folder) / CARD} is no ensemble's; expected what Ensemble.save wrote")
-        members = tuple(LearnedDynamics.load(Path(folder) / f"member-{i}") for i in range(int(card["members"])))
-        return Ensemble(members, float(card["usual"]))
+        with store.reading(folder, "an ensemble"):
+            members = tuple(LearnedDynamics.load(Path(folder) / f"member-{i}") for i in range(int(card["members"])))
+            return Ensemble(members, float(card["usual"]))
 
     def __repr__(self) -> str:
         return f"Ensemble of {len(self.members)}, usual disagreement {self.usual:.3g}; the first is\n{self.model!r}"

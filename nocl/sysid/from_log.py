@@ -6,14 +6,18 @@
 
 from __future__ import annotations
 
+import copy
+import warnings
 from collections.abc import Callable
 
 import numpy as np
 import torch
 from scipy.optimize import minimize
 from torch import Tensor
+from torch.func import jacrev, vmap
 
 from nocl.nets import MLP, FeatureNet
+from nocl.substeps import FINEST, Grid, grid_of
 from nocl.support.checks import Array
 from nocl.sysid import fitting
 from nocl.sysid.logs.derivatives import labels
@@ -23,33 +27,81 @@ from nocl.sysid.networks import assemble
 from nocl.sysid.progress import Progress
 from nocl.sysid.settings import LogSettings
 from nocl.sysid.structure import Structure
+from nocl.translate.rk4 import rk4_interval
 
 MEMORY = 30  # of L-BFGS
+MOST = 8  # steps that are chosen: each costs as much as one
+SAMPLES = 1000  # of a log, about, that the length of steps is judged on
 
 
 def fit_log(log: Log, parts: Structure, settings: LogSettings, seed: int,
-            bar: Progress) -> tuple[FeatureNet, list[WindowFit]]:
-    """f_theta of the given structure, fitted to a log, and how the simulation error went down.
+            bar: Progress) -> tuple[FeatureNet, list[WindowFit], int]:
+    """f_theta of the given structure, fitted to a log, how the simulation error went down, and RK4 steps between two
+    samples, with which it was fitted.
 
     Raises ValueError where no finite weights were found.
     """
     x, u, xdot = (np.concatenate(a) for a in zip(*map(labels, log), strict=True))
     net = assemble(parts, initial(parts, settings, seed), settings.angles)
     if not parts.groups:
-        return net, []
+        return net, [], settings.substeps or 1
     unit = output_units(parts, net, xdot)
     fit_derivatives(net, unit, x, u, xdot, settings, bar)
-    stages = []
-    if settings.steps:
-        total = settings.steps * len(lengths(settings.window, log))
-        with bar.stage("simulation error", total) as report:
-            stages = fit_simulation(net, unit, log, window=settings.window, windows=settings.windows,
-                                    steps=settings.steps, substeps=settings.substeps, ridge=settings.ridge,
-                                    rng=np.random.default_rng((seed, 3)), report=report)
+    stages, substeps = _fit_simulation(net, unit, log, settings, seed, bar)
     if not all(torch.isfinite(p).all() for p in net.parameters()):
         raise ValueError("identify: the fit to the log is not finite; expected numbers of ordinary size: look for "
                          "outliers, or scale states, controls and time")
-    return net.requires_grad_(False), stages
+    return net.requires_grad_(False), stages, substeps
+
+
+def _fit_simulation(net: FeatureNet, unit: Array, log: Log, settings: LogSettings, seed: int,
+                    bar: Progress) -> tuple[list[WindowFit], int]:
+    """Fits the network to the log by simulation, by as many RK4 steps as the fit turns out to need."""
+    first, stages = copy.deepcopy(net.state_dict()), list[WindowFit]()
+
+    def ask(substeps: int) -> Grid:
+        net.load_state_dict(first)
+        if settings.steps:
+            with bar.stage("simulation error", settings.steps * len(lengths(settings.window, log))) as report:
+                stages[:] = fit_simulation(net, unit, log, window=settings.window, windows=settings.windows,
+                                           steps=settings.steps, substeps=substeps, ridge=settings.ridge,
+                                           rng=np.random.default_rng((seed, 3)), report=report)
+        return steps_of(net, log, substeps)
+
+    grid = ask(settings.substeps or 1)
+    again = grid.needed if grid.coarse and settings.substeps is None else None
+    if grid.coarse:
+        warnings.warn(f"identify: {grid}{', so it is fitted again' if again else ''}", stacklevel=6)
+    if again:
+        grid = ask(again := min(again, MOST))
+    return stages, again or grid.substeps
+
+
+def steps_of(net: FeatureNet, log: Log, substeps: int) -> Grid:
+    """Whether steps between the samples of a log are short enough for f_theta, from one sample to the next."""
+    x, u, h = (np.concatenate(a) for a in zip(*((r.smooth.x[:-1], r.u[:len(r) - 1], np.diff(r.t)) for r in log),
+                                              strict=True))
+    rows = np.flatnonzero(np.isfinite(x).all(axis=1) & np.isfinite(u).all(axis=1))
+    rows = rows[:: max(len(rows) // SAMPLES, 1)]
+    X, U, H = (torch.from_numpy(np.ascontiguousarray(a[rows])) for a in (x, u, h[:, None]))
+    spread = spread_of(x[rows])
+
+    def after(n: int) -> Array:
+        with torch.no_grad():
+            return np.asarray(rk4_interval(net, X, U, H, n).numpy())
+
+    true = after(FINEST)
+
+    def error(n: int) -> float:
+        with np.errstate(all="ignore"):
+            worst = float((np.abs(after(n) - true) / spread).max(initial=0.0))
+        return worst if np.isfinite(worst) else np.inf
+
+    A = jacrev(lambda x, u: net(x[None], u[None])[0])
+    slopes = vmap(A)(X, U).detach().numpy()
+    rate = np.abs(np.linalg.eigvals(slopes[np.isfinite(slopes).all(axis=(1, 2))]).real).max(initial=0.0)
+    return grid_of(float(np.median(h[rows])), substeps, error, 1 / rate if rate > 0 else np.inf,
+                   "its simulation and its equations")
 
 
 def first_states(log: Log) -> list[tuple[Array, Recording]]:

@@ -29,6 +29,7 @@ from nocl.nets import MLP, FeatureNet
 from nocl.sampling import Seed
 from nocl.support import checks
 from nocl.support.checks import Array
+from nocl.support.store import reading
 from nocl.support.threads import one_thread
 from nocl.sysid import paper
 from nocl.sysid.figures import slices
@@ -99,7 +100,8 @@ class LearnedDynamics:
     def validate(self, log: Log, steps: Sequence[int] = HORIZONS, *, every: int | None = None) -> Validation:
         """Errors of simulations of f_theta from a log's states, by number of steps: see nocl.sysid.logs.validation."""
         log.check(self.system)
-        return validate(self.net, log, steps, every, int(self.card.get("settings", {}).get("substeps", 1)))
+        settings = self.card.get("settings", {})  # where cards had them before
+        return validate(self.net, log, steps, every, int(self.card.get("substeps", settings.get("substeps", 1))))
 
     def outside(self, x: ArrayLike, what: str | None = None) -> Any:
         """Which states [N, nx] the model was not taught about, [N] bool; a UserWarning names `what`, where given.
@@ -154,11 +156,13 @@ class LearnedDynamics:
     def load(folder: str | Path) -> LearnedDynamics:
         """What `save` wrote, bit by bit; ValueError for a missing, altered or foreign file."""
         record = records.load(folder, KIND)
-        system = System.from_data(record.card["system"])
-        parts = _structure_from(record.card["parts"], record.functions, box_of(system))
-        coverage = record.card.get("coverage")
-        return LearnedDynamics(system, record.nets["f"].eval(), record.card["structure"], record.card["card"], parts,
-                               None if coverage is None else Coverage.from_data(coverage))
+        with reading(folder, "a model"):
+            system = System.from_data(record.card["system"])
+            parts = _structure_from(record.card["parts"], record.functions, box_of(system))
+            coverage = record.card.get("coverage")
+            card = record.card["card"]
+            return LearnedDynamics(system, record.nets["f"].eval(), record.card["structure"], card, parts,
+                                   None if coverage is None else Coverage.from_data(coverage))
 
     def __repr__(self) -> str:
         nets = [net for net in self.net.nets if isinstance(net, MLP)]
@@ -207,7 +211,7 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
     UserWarning
         Where the labels speak against what is stated.
     """
-    settings = _check_arguments(system, method, settings, seed, data)
+    settings = _check_arguments(system, method, gradients, settings, seed, data)
     stated, start, bar = Stated.of(system, known, control_affine), time.perf_counter(), Progress(system.name, progress)
     if isinstance(data, Log):
         assert isinstance(settings, LogSettings)
@@ -249,12 +253,13 @@ def _from_log(system: System, log: Log, stated: Stated, settings: LogSettings, s
     start = time.perf_counter()
     parts = stated.plain(data_box(system, np.vstack([np.hstack([s, r.u]) for s, r in first_states(log)])))
     said = contradictions_of(log, stated.z, stated.rows)
-    net, stages = fit_log(log, parts, settings, seed, bar)
-    seen = validate(net, log, (1, min(settings.window, max(map(len, log)) - 1)), substeps=settings.substeps)
+    net, stages, substeps = fit_log(log, parts, settings, seed, bar)
+    seen = validate(net, log, (1, min(settings.window, max(map(len, log)) - 1)), substeps=substeps)
     _warn_of(said, "log speaks", 5)
     _warn_of_no_progress(stages, seen)
     errors = ", ".join(f"{100 * e:.3g} % after {k}" for k, e in zip(seen.steps, seen.relative, strict=True))
     card = {"method": "log", "gradients": False, "seed": seed, "settings": asdict(settings), "labels": len(log),
+            "substeps": substeps,
             "seconds": round(time.perf_counter() - start, 3), "torch": torch.__version__,
             "windows": [asdict(stage) for stage in stages], "contradictions": said,
             "score": f"simulation error on its own log, in units of the states' spread: {errors} steps"}
@@ -284,16 +289,16 @@ def _check_stated(stated: Stated, method: str) -> None:
                          "the default method")
 
 
-def _check_arguments(system: System, method: str, settings: Settings | PaperSettings | LogSettings | None, seed: int,
+def _check_arguments(system: System, method: str, gradients: bool,
+                     settings: Settings | PaperSettings | LogSettings | None, seed: int,
                      data: Dataset | Log | None) -> Settings | PaperSettings | LogSettings:
-    if not isinstance(system, System):
-        raise ValueError(f"identify: system is a {type(system).__name__}; expected a nocl.System: "
-                         "of an OCP, pass ocp.system")
+    checks.instance(System, system, "system", "identify", "of an OCP, pass ocp.system")
     system.refuse_parameters("identify")
-    if method not in RECIPES:
-        raise ValueError(f"identify: method is {method!r}; expected one of {', '.join(RECIPES)}")
-    if isinstance(seed, bool) or not isinstance(seed, int) or seed < 0:
-        raise ValueError(f"identify: seed is {seed!r}; expected an integer >= 0")
+    checks.word(method, RECIPES, "method", "identify")
+    checks.whole(seed, "seed", "identify", most=2**62)
+    checks.flag(gradients, "gradients", "identify")
+    if data is not None and not isinstance(data, (Dataset, Log)):
+        raise ValueError(f"identify: data is a {type(data).__name__}; expected a nocl.Dataset or a nocl.Log")
     if isinstance(data, Log) and method != "default":
         raise ValueError(f"identify: method is {method!r}; logs take 'default' only: leave it out")
     expected = LogSettings if isinstance(data, Log) else PaperSettings if method == "paper" else Settings

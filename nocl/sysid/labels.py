@@ -59,29 +59,20 @@ class Source:
 
 
 def _checked_data(system: System, data: Dataset) -> tuple[Array, Array, Array | None]:
-    """(z [N, nz], xdot [N, nx], Jacobians [N, nx, nz] or None) of a Dataset; wrong shapes and NaN raise ValueError."""
+    """(z [N, nz], xdot [N, nx], Jacobians [N, nx, nz] or None) of a Dataset; ValueError where it is of other sizes."""
     if not isinstance(data, Dataset):
         raise ValueError(f"identify: data is a {type(data).__name__}; expected a nocl.Dataset(x, u, xdot, A, B)")
-    nx, nu = system.nx, system.nu
-    n = len(np.asarray(data.x))
+    n = len(data)
     if n < 2:
         raise ValueError(f"identify: data has {n} samples; expected at least 2, better thousands")
     if (data.A is None) != (data.B is None):
         raise ValueError("identify: data has only one of the Jacobians A and B; expected both or neither")
-    shapes = {"x": (n, nx), "u": (n, nu), "xdot": (n, nx), "A": (n, nx, nx), "B": (n, nx, nu)}
-    arrays = {}
-    for name, shape in shapes.items():
-        if getattr(data, name) is None:
-            continue
-        arrays[name] = array = np.asarray(getattr(data, name), dtype=np.float64)
-        if array.shape != shape:
-            raise ValueError(f"identify: data.{name} has shape {array.shape}; expected {shape} for {system.name!r}")
-        if not np.isfinite(array).all():
-            row = int(np.argwhere(~np.isfinite(array))[0][0])
-            raise ValueError(f"identify: data.{name}[{row}] is {array[row].tolist()}; expected finite numbers: "
-                             "drop that sample")
-    gradient = np.concatenate([arrays["A"], arrays["B"]], axis=2) if "A" in arrays else None
-    return np.hstack([arrays["x"], arrays["u"]]), arrays["xdot"], gradient
+    for name, array, columns in (("x", data.x, system.nx), ("u", data.u, system.nu)):
+        if array.shape[1] != columns:
+            raise ValueError(f"identify: data.{name} has shape {array.shape}; expected {(n, columns)} for "
+                             f"{system.name!r}")
+    z = np.hstack([data.x, data.u])
+    return z, data.xdot, None if data.A is None or data.B is None else np.concatenate([data.A, data.B], axis=2)
 
 
 def data_box(system: System, z: Array) -> Variables:

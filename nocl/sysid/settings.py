@@ -84,7 +84,8 @@ class LogSettings(Scaled):
                        "derivatives alone", least=0)
     window: int = count(40, "steps that are simulated in one go in the end: windows start with 2, and grow")
     windows: int = count(1000, "of that length, at most, drawn at random beyond")
-    substeps: int = count(1, "RK4 steps between two samples")
+    substeps: int | None = count(None, "RK4 steps between two samples", none="1, or as many as the fit turns out to "
+                                 "need; the card says how many")
     ridge: float | None = nonnegative(None, "times the sum of squared weights, beside the mean of squared residuals",
                                       none="one over the number of residuals, the most probable weights where those of "
                                       "a standard normal distribution are expected")

@@ -41,8 +41,7 @@ class Stated:
             if isinstance(value, str):
                 value = _named(system, name, value)
             rows[system.state_names.index(name)] = checks.expression(value, 1, z, f"known[{name!r}]", "identify")
-        if not isinstance(control_affine, bool):
-            raise ValueError(f"identify: control_affine is {control_affine!r}; expected True or False")
+        checks.flag(control_affine, "control_affine", "identify")
         return Stated(z, rows, control_affine)
 
     def __bool__(self) -> bool:
@@ -102,7 +101,8 @@ def _items(system: System, known: Known | None) -> dict[str, Any]:
         return {}
     if isinstance(known, Mapping):
         return dict(known)
-    names = [known] if isinstance(known, str) else list(known)
+    names = [known] if isinstance(known, str) else checks.words(known, "known (or a dict from states to derivatives)",
+                                                                "identify")
     bad = [n for n in names if n not in system.state_names]
     if bad:
         raise ValueError(f"identify: known has {bad[0]!r}; expected names of states ({', '.join(system.state_names)}), "

@@ -31,6 +31,7 @@ from nocl.solvers.cnd.labels import LONGEST
 from nocl.solvers.cnd.unwrapped import Unwrapped
 from nocl.support import checks
 from nocl.support.checks import Array
+from nocl.support.store import reading
 from nocl.translate.arguments import Arguments
 from nocl.translate.torch_functions import to_torch
 
@@ -53,6 +54,12 @@ class CND:
 
     def __init__(self, ocp: OCP, policy: FeatureNet, value: FeatureNet | None = None,
                  card: Mapping[str, Any] | None = None) -> None:
+        checks.problem(ocp, "CND")
+        checks.instance(FeatureNet, policy, "policy", "CND", "as nocl.train makes it")
+        if value is not None:
+            checks.instance(FeatureNet, value, "value", "CND", "as nocl.train makes it, or None")
+        if card is not None:
+            checks.instance(Mapping, card, "card", "CND", "plain data")
         self.ocp, self.card = ocp, dict(card or {})
         policy.double().eval().requires_grad_(False)
         self._at_rates = policy if "dt" in policy.inputs.name_in() else None
@@ -107,11 +114,10 @@ class CND:
         dt = 0 is continuous feedback. Raises ValueError for dt beyond what was trained, or where none was.
         """
         if self._at_rates is None:
-            raise ValueError(f"this controller of {self.ocp.system.name} knows one rate only: train with "
-                             "TrainSettings(control_dt=True)")
+            raise ValueError(f"this controller of {self.ocp.system.name} knows one rate only; expected one for every "
+                             "rate: train with TrainSettings(control_dt=True)")
         longest = self.ocp.horizon / LONGEST
-        if not (isinstance(dt, (int, float)) and 0 <= dt <= longest * (1 + 1e-9)):
-            raise ValueError(f"dt is {dt!r}; expected 0 to {longest:g} s, the horizon over {LONGEST}, as trained")
+        checks.between(dt, 0.0, longest * (1 + 1e-9), "dt", "CND.at_rate", f", the horizon over {LONGEST}, as trained")
         return CND(self.ocp, at_rate(self._at_rates, float(dt)), self.value_net, self.card | {"dt": float(dt)})
 
     def value(self, x: ArrayLike, t: ArrayLike = 0.0, p: Any = None) -> Array:
@@ -197,13 +203,12 @@ class CND:
         Each with header, test vectors and self-test, as SYSTEM_policy, SYSTEM_gain, ...; dtype "float64" or "float32";
         only: names of `parts()`.
         """
-        there = {part.name: part for part in self.export_parts()}
-        wanted = [n for n in there if n != "closed_loop"] if only is None else list(only)
+        place, there = checks.folder(folder, "folder", "to_c"), {part.name: part for part in self.export_parts()}
+        wanted = [n for n in there if n != "closed_loop"] if only is None else checks.words(only, "only", "to_c")
         for name in wanted:
-            if name not in there:
-                raise ValueError(f"to_c: only has {name!r}; expected names of {', '.join(there)}")
-            there[name].to_c(Path(folder), self.ocp.system.name, dtype=dtype, note=repr(self))
-        return Path(folder)
+            checks.word(name, tuple(there), "only", "to_c")
+            there[name].to_c(place, self.ocp.system.name, dtype=dtype, note=repr(self))
+        return place
 
     def export(self, folder: str | os.PathLike[str], to: Sequence[str] = ("casadi",), **options: Any) -> Certificate:
         """Files of all `parts()` in `folder`, proven equal to this controller: see nocl.exports.bundle.export."""
@@ -226,20 +231,16 @@ class CND:
         """Write controller, value, problem and card as one data-only file in `folder`."""
         policy = self.policy if self._at_rates is None else self._at_rates
         nets = {"policy": _smallest(policy)} | ({} if self.value_net is None else {"value": _smallest(self.value_net)})
-        return records.save(Path(folder), KIND, nets=nets, card={"ocp": self.ocp.to_data(), "card": self.card})
+        return records.save(folder, KIND, nets=nets, card={"ocp": self.ocp.to_data(), "card": self.card})
 
     @classmethod
     def load(cls, folder: str | os.PathLike[str]) -> CND:
         """What `save` wrote; raises ValueError for a missing, damaged or foreign file."""
-        record = records.load(Path(folder), KIND)
-        try:
+        record = records.load(folder, KIND)
+        with reading(folder, "a controller"):
             ocp, nets = OCP.from_data(record.card["ocp"]), record.nets
             _check_sizes(ocp, nets)
             return cls(ocp, nets["policy"], nets.get("value"), record.card["card"])
-        except KeyError as error:
-            raise ValueError(f"{folder}: not a controller written by nocl: {error} is missing") from None
-        except checks.MALFORMED as error:
-            raise ValueError(f"{folder}: not a controller written by nocl: {type(error).__name__} {error}") from None
 
     def __repr__(self) -> str:
         facts = ", ".join(f"{k} {v}" for k, v in self.card.items() if isinstance(v, (str, int, float)))
@@ -258,7 +259,7 @@ class CND:
         return to_torch(self.ocp.functions.f)
 
     def _tensors(self, rows: Array, t: ArrayLike, p: Any) -> tuple[Tensor, ...]:
-        times = np.asarray(t, dtype=np.float64)
+        times = checks.numeric(t, "t", self.ocp.system.name, f"one time or {len(rows)}")
         if times.shape not in ((), (len(rows),)) or not ((times >= 0) & (times <= self.ocp.horizon * (1 + 1e-9))).all():
             raise ValueError(f"t is {np.array2string(times, threshold=4)}; expected one time or {len(rows)}, "
                              f"each in [0, {self.ocp.horizon:g}]")
@@ -273,7 +274,8 @@ class CND:
         return self.value_net
 
     def _export(self, net: FeatureNet, name: str, out: str, backend: str, build_dir: Build) -> ca.Function:
-        return to_casadi(net, backend=backend, name=name, build_dir=None if build_dir is None else Path(build_dir),
+        place = None if build_dir is None else checks.folder(build_dir, "build_dir", name)
+        return to_casadi(net, backend=backend, name=name, build_dir=place,
                          in_names=self.ocp.functions.feedback().names, out_names=[out])
 
 
@@ -316,12 +318,11 @@ def _check_sizes(ocp: OCP, nets: Mapping[str, FeatureNet]) -> None:
 
 def pretrained(name: str, dynamics: str = "exact") -> CND:
     """A controller that comes with nocl, trained on the exact f or on a learned one (dynamics="learned")."""
-    if dynamics not in ("exact", "learned"):
-        raise ValueError(f"dynamics is {dynamics!r}; expected 'exact' or 'learned'")
+    checks.word(dynamics, ("exact", "learned"), "dynamics", "pretrained")
     shipped = Path(str(files("nocl"))) / "pretrained"
     folder = shipped / f"{name}-{dynamics}"
-    if not folder.is_dir():
+    if folder not in shipped.glob("*-*"):
         there = ", ".join(sorted(p.name for p in shipped.glob("*-*"))) or "none"
-        raise ValueError(f"no pretrained controller {name!r} on {dynamics} dynamics; there are: {there}. "
-                         f"Train one: nocl.train(nocl.load_ocp({name!r}))")
+        raise ValueError(f"no pretrained controller {checks.shown(name)} on {dynamics} dynamics; there are: {there}. "
+                         f"Train one: nocl.train(nocl.load_ocp(name))")
     return CND.load(folder)

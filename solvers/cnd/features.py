@@ -9,25 +9,38 @@ depends on p in the same units as the state, and the path constraints, which tel
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import casadi as ca
 import numpy as np
 
 from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
+from nocl.scales import usual_sizes
 from nocl.support.checks import Array
 from nocl.translate.arguments import Arguments
 
 if TYPE_CHECKING:
     from nocl.solvers.cnd.labels import Labels
-    from nocl.solvers.cnd.value import ValueLabels
 
 DEGREE = 6  # of the polynomials in time
+CONSTANT = 1e-6  # of its usual size: what varies less is as good as constant
 LEAST_TIME = 0.025  # of the horizon: time to go is never counted as less
+Part = tuple[ca.SX, Array | float]  # features [k], and the usual size of each
 
 
-def features(ocp: OCP, labels: Labels | ValueLabels, dt: Array | None = None, *, plain: bool = False) -> ca.Function:
+class Places(Protocol):
+    """Where labels are: x [n, nx], t [n], p [n, np]."""
+
+    @property
+    def x(self) -> Array: ...
+    @property
+    def t(self) -> Array: ...
+    @property
+    def p(self) -> Array: ...
+
+
+def features(ocp: OCP, labels: Places, dt: Array | None = None, *, plain: bool = False) -> ca.Function:
     """(x, t[, p]) -> phi, each feature with mean 0 and standard deviation 1 over the labels' x, t, p.
 
     With dt [n] it is (x, t[, p], dt) -> phi: the clock then stands at the middle of the time that a control is held
@@ -39,49 +52,63 @@ def features(ocp: OCP, labels: Labels | ValueLabels, dt: Array | None = None, *,
     state, time = at["x"], at["t"] if dt is None else at["t"] + at["dt"] / 2
     tau, moment = 2 * time / ocp.horizon - 1, 2 * (t if dt is None else t + dt / 2) / ocp.horizon - 1
     to_go = ca.fmax(ocp.horizon - time, 0)
+    half = usual_sizes(ocp).x
     once = [i for i in range(s.nx) if i not in ocp.periodic]  # the others have many images: sines and cosines only
     angles = [g(state[i]) for i in s.angle_indices for g in (ca.sin, ca.cos)]
     off = state - (ocp.goal(at["p"])[0] if ocp.goal_varies else ca.DM(ocp.x_goal))
     left = ca.vertcat(*(ca.sin(off[i]) if i in ocp.periodic else off[i] for i in range(s.nx)))
     rush = left / (to_go + LEAST_TIME * ocp.horizon)
     clock = ca.vertcat(tau, ca.log(to_go / ocp.horizon + LEAST_TIME) / 2)
-    more = [state[once]] if plain else []
-    raw = ca.vertcat(_standard(state, x, tau, moment)[once], *angles, clock, rush, *more,
-                     *_of_parameters(ocp, at, off, labels, tau, moment), *([] if dt is None else [at["dt"]]))
+    parts: list[Part] = [(_standard(state, x, tau, moment, half)[once], 1.0), (ca.vertcat(*angles, clock), 1.0),
+                         (rush, np.array([1.0 if i in ocp.periodic else half[i] for i in range(s.nx)])),
+                         *([(state[once], half[once])] if plain else []),
+                         *_of_parameters(ocp, at, off, labels, tau, moment),
+                         *([] if dt is None else [(at["dt"], ocp.horizon)])]
+    raw = ca.vertcat(*(e for e, _ in parts))
+    usual = np.concatenate([np.broadcast_to(size, e.numel()) for e, size in parts])
     given = at.columns(x=x, t=t, p=labels.p, dt=dt)
     some = slice(None, None, -(-len(t) // 20_000))  # of every kind of label
     values = at.function("raw", {"raw": raw})(*(a[:, some] for a in given)).full()
-    centre, width = values.mean(axis=1), values.std(axis=1) + 1e-6
+    centre, width = values.mean(axis=1), values.std(axis=1) + CONSTANT * usual
     return at.function("features", {"phi": (raw - ca.DM(centre)) / ca.DM(width)})
 
 
-def _standard(e: ca.SX, values: Array, tau: ca.SX, moment: Array) -> ca.SX:
-    """e [k] about its mean at the time, in units of its spread then, over values [n, k] at times tau = moment [n]."""
-    mean, spread = _moments_in_time(values, moment)
+def _standard(e: ca.SX, values: Array, tau: ca.SX, moment: Array, half: Array) -> ca.SX:
+    """e [k] about its mean at the time, in units of its spread then, over values [n, k] at times tau = moment [n].
+
+    half : usual sizes of e [k]
+    """
+    mean, spread = _moments_in_time(values, moment, half)
     return (e - _polynomial(mean, tau)) / ca.exp(_polynomial(spread, tau))
 
 
-def _of_parameters(ocp: OCP, at: Arguments, off: ca.SX, labels: Labels | ValueLabels, tau: ca.SX,
-                   moment: Array) -> list[ca.SX]:
+def _of_parameters(ocp: OCP, at: Arguments, off: ca.SX, labels: Places, tau: ca.SX,
+                   moment: Array) -> list[Part]:
     """The features that a problem with parameters has beside those of its state."""
     if not ocp.np:
         return []
+    low, high = ocp.parameter_box
     moves = [i for i in range(ocp.system.nx) if ocp.goal_varies and ca.depends_on(off[i], at["p"])]
     turning, plain = ([i for i in moves if (i in ocp.periodic) == periodic] for periodic in (True, False))
-    relative = [g(off[i]) for i in turning for g in (ca.sin, ca.cos)]
+    parts: list[Part] = [(at["p"], np.where(high > low, (high - low) / 2, 1.0)),
+                         *((g(off[i]), 1.0) for i in turning for g in (ca.sin, ca.cos))]
     if plain:
-        away = ocp.from_goal(labels.x, labels.p)[:, plain]
-        relative.append(_standard(off[plain], away, tau, moment))
-    walls = [at.but("dt").call(ocp.functions.h)] if ocp.path_constraints else []
-    return [at["p"], *relative, *walls]
+        away, half = ocp.from_goal(labels.x, labels.p)[:, plain], usual_sizes(ocp).x[plain]
+        parts.append((_standard(off[plain], away, tau, moment, half), 1.0))
+    if ocp.path_constraints:
+        parts.append((at.but("dt").call(ocp.functions.h), ocp.constraint_scales))
+    return parts
 
 
-def _moments_in_time(x: Array, tau: Array) -> tuple[Array, Array]:
-    """Chebyshev coefficients [nx, DEGREE+1] of the mean and of the log standard deviation of x at tau in [-1, 1]."""
+def _moments_in_time(x: Array, tau: Array, half: Array) -> tuple[Array, Array]:
+    """Chebyshev coefficients [nx, DEGREE+1] of the mean and of the log standard deviation of x at tau in [-1, 1].
+
+    half : usual sizes of x [nx]
+    """
     bins = np.clip(((tau + 1) * 10).astype(int), 0, 19)
     filled = [bins == b for b in range(20) if (bins == b).sum() > 8] or [bins >= 0]
     centres, groups = [tau[b].mean() for b in filled], [x[b] for b in filled]
-    floor = 0.05 * x.std(axis=0) + 1e-6
+    floor = 0.05 * x.std(axis=0) + CONSTANT * half
     degree = min(DEGREE, max(len(centres) - 1, 0))
     mean = np.polynomial.chebyshev.chebfit(centres, [g.mean(axis=0) for g in groups], degree)
     spread = np.polynomial.chebyshev.chebfit(centres, [np.log(g.std(axis=0) + floor) for g in groups], degree)
@@ -103,7 +130,7 @@ def policy_net(ocp: OCP, labels: Labels, sizes: tuple[int, ...],
     """
     s = ocp.system
     phi = features(ocp, labels, labels.dt if control_dt else None)
-    mean, spread = ca.DM(labels.u.mean(axis=0)), ca.DM(labels.u.std(axis=0) + 1e-9)
+    mean, spread = ca.DM(labels.u.mean(axis=0)), ca.DM(labels.u.std(axis=0) + 1e-9 * usual_sizes(ocp).u)
     y, u = ca.SX.sym("y", s.nu), ca.SX.sym("u", s.nu)
     clipped = ca.fmin(ca.fmax(mean + spread * y, ca.DM(s.lbu)), ca.DM(s.ubu))
     outputs = Arguments.of(phi).function("controls", {"u": clipped}, y=y)

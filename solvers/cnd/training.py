@@ -30,6 +30,7 @@ from tqdm import tqdm
 from nocl.data import Solution
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
+from nocl.sampling import own_numbers
 from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.features import at_rate, policy_net
 from nocl.solvers.cnd.identity import identity
@@ -52,9 +53,9 @@ from nocl.solvers.cnd.validate import (
 from nocl.solvers.cnd.value import ValueLabels, on_fine_grid, value_loss, value_net, value_tails
 from nocl.solvers.ddp.bank import SolutionBank, extend
 from nocl.solvers.ddp.global_search import solve_globally
-from nocl.solvers.ddp.solver import DDP
-from nocl.solvers.grid import TRIED, measured
-from nocl.support import store
+from nocl.solvers.ddp.solver import DDP, substeps_for
+from nocl.substeps import FINE
+from nocl.support import checks, store
 from nocl.support.checks import Array
 from nocl.support.threads import one_thread
 
@@ -67,8 +68,6 @@ CHECKPOINT = "training.safetensors"
 VALUE_LARGE = 0.05  # mean |V - J*| / J* that a warning is given above
 VALUE_HELD_OUT = 16  # times held_out: a mean of relative errors hangs on the few states that are hard
 LOSSES = 40  # of each regression that the card keeps
-PROBES = 8  # initial states that substeps are chosen on
-STREAM = 0x6E6F636C  # training's own random numbers: never those of initial_states.sample(n, seed), whatever the seeds
 
 
 def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "default",
@@ -92,23 +91,20 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
         Whether to show progress; by default where the terminal is one.
     """
     _check(ocp, dynamics, seed, out)
+    checks.word(method, ("default", "paper"), "method", "train")
     if method == "paper":
         chosen = _expect(settings, PaperSettings)
         checkpoint = None if out is None else Path(out) / CHECKPOINT
         ocp.refuse_parameters("train(method='paper')")
         policy, value, card = train_paper(ocp, dynamics, chosen, seed=seed, progress=progress, checkpoint=checkpoint)
         return CND(ocp, policy, value, card)
-    if method != "default":
-        raise ValueError(f"train: method is {method!r}; expected 'default' or 'paper'")
     ocp.check_strict("train")
     return Training(ocp, dynamics, _expect(settings, TrainSettings), seed, out, progress).run()
 
 
 def _check(ocp: OCP, dynamics: LearnedDynamics | None, seed: int, out: str | os.PathLike[str] | None) -> None:
-    if not isinstance(ocp, OCP):
-        raise ValueError(f"train: ocp is a {type(ocp).__name__}; expected a nocl.OCP")
-    if isinstance(seed, bool) or not isinstance(seed, int) or not 0 <= seed < 2**62:
-        raise ValueError(f"train: seed is {seed!r}; expected a whole number from 0 to 2**62")
+    checks.instance(OCP, ocp, "ocp", "train", "nocl.load_ocp(name)")
+    checks.whole(seed, "seed", "train", most=2**62 - 1)
     if out is not None and Path(out).exists() and not Path(out).is_dir():
         raise ValueError(f"train: out is the file {out}; expected a folder for checkpoints")
     if dynamics is not None and not hasattr(dynamics, "system"):
@@ -125,24 +121,6 @@ def _expect(settings: Any, kind: Any) -> Any:
     return settings or kind()
 
 
-def substeps_for(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int) -> int:
-    """As many as a few initial states' solutions ask for; more are tried where nothing is solved with few."""
-    functions = ocp.functions if dynamics is None else ocp.functions.on(dynamics.to_casadi())
-    substeps, grid = 1, None
-    while substeps <= TRIED[-1]:
-        ddp = DDP(ocp, intervals=intervals, substeps=substeps, dynamics=dynamics, constraints="soft")
-        ddp.checked = True
-        probes = Problems.initial(ocp, PROBES, np.random.default_rng([0, STREAM]))
-        grid = measured(ocp, functions, ddp.solve(probes.x, p=probes.given_p), substeps)
-        if grid is not None and grid.needed == substeps:
-            return substeps
-        if grid is not None and grid.needed is None:
-            warnings.warn(f"{ocp.system.name}: {grid}", stacklevel=5)
-            return TRIED[-1]
-        substeps = 4 * substeps if grid is None or grid.needed is None else grid.needed
-    return 1  # nothing can be solved: what follows says so
-
-
 class Training:
     """One run of the default method; its state between rounds is what a checkpoint holds."""
 
@@ -151,7 +129,7 @@ class Training:
         self.ocp, self.settings, self.seed = ocp, settings, seed
         self.learned = dynamics is not None
         self.in_torch = InTorch(ocp, dynamics)
-        self.substeps = settings.substeps or substeps_for(ocp, dynamics, settings.intervals)
+        self.substeps = settings.substeps or substeps_for(ocp, dynamics, settings.intervals, FINE)
         soft = {"dynamics": dynamics, "constraints": "soft"}
         self.ddp = DDP(ocp, intervals=settings.intervals, substeps=self.substeps, **soft)
         self.fine = DDP(ocp, intervals=4 * settings.intervals, substeps=-(-self.substeps // 4), **soft)
@@ -353,7 +331,7 @@ class Training:
         self.fitting_cpu += (time.process_time() - cpu) * fits
 
     def _rng(self, stage: int) -> np.random.Generator:
-        return np.random.default_rng([self.seed, stage, STREAM])
+        return own_numbers(self.seed, stage)
 
     def _identity(self) -> str:
         return identity(self.ocp, self.settings, self.seed, self.in_torch.function["f"])

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,9 +11,6 @@ from numpy.typing import ArrayLike
 from nocl.ocp import OCP
 from nocl.support import checks
 from nocl.support.checks import Array
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 class Unwrapped:

@@ -96,15 +96,19 @@ class GlobalDDP:
     starts: int = 16
     seed: int = 0
 
+    @property
+    def substeps(self) -> int:
+        return self.ddp.substeps
+
     def solve(self, x0: ArrayLike, workers: int | str = "auto", out: str | os.PathLike[str] | None = None,
               progress: bool | None = None, p: Any = None) -> Solution:
         return solve_globally(self.ddp, x0, p=p, starts=self.starts, seed=self.seed, workers=workers, out=out,
                               progress=progress)
 
 
-def global_ddp(ocp: OCP, intervals: int, seed: int) -> GlobalDDP:
+def global_ddp(ocp: OCP, intervals: int, seed: int, substeps: int | None = None) -> GlobalDDP:
     """DDP from everywhere, as the command line makes it."""
-    return GlobalDDP(DDP(ocp, intervals=intervals), seed=seed)
+    return GlobalDDP(DDP(ocp, intervals=intervals, substeps=substeps), seed=seed)
 
 
 class _Kept(Search):
@@ -294,13 +298,16 @@ def settled(ocp: OCP, z: Array, p: Array, dynamics: Any = None) -> tuple[Array, 
     s, z, fine = ocp.system, z.copy(), np.ones(len(z), dtype=bool)
     if s.xdot is None and dynamics is None:
         return z, ~fine
-    of = ocp.functions.on(dynamics_function(ocp, dynamics))
+    low, high = np.r_[s.lbx, s.lbu], np.r_[s.ubx, s.ubu]
+    of, half = ocp.functions.on(dynamics_function(ocp, dynamics)), (high - low) / 2
+    rate = half[:s.nx] / ocp.horizon  # what 1 stands for in f; half the box in z
 
     def linear(rows: Rows) -> tuple[Array, Array]:
         x, u = np.split(z[rows], [s.nx], axis=1)
         at = of.arguments.columns(x=x, u=u, t=np.zeros(len(rows)), p=p[rows])
         AB = (j.full().reshape(s.nx, len(rows), -1) for j in of.jacobian.map(len(rows))(*at))
-        return of.f.map(len(rows))(*at).full().T, np.concatenate(list(AB), axis=2).transpose(1, 0, 2)
+        J = np.concatenate(list(AB), axis=2).transpose(1, 0, 2)
+        return of.f.map(len(rows))(*at).full().T / rate, J / rate[:, None] * half
 
     for _ in range(NEWTON):
         rows = np.flatnonzero(fine)
@@ -309,9 +316,9 @@ def settled(ocp: OCP, z: Array, p: Array, dynamics: Any = None) -> tuple[Array, 
         value, J = linear(rows)
         good = np.isfinite(value).all(axis=1) & np.isfinite(J).all(axis=(1, 2))
         fine[rows[~good]] = False
-        z[rows[good]] -= np.einsum("bij,bj->bi", np.linalg.pinv(J[good], rcond=1e-8), value[good])
+        z[rows[good]] -= half * np.einsum("bij,bj->bi", np.linalg.pinv(J[good], rcond=1e-8), value[good])
     rows = np.flatnonzero(fine)
-    inside = (z[rows] >= np.r_[s.lbx, s.lbu]).all(axis=1) & (z[rows] <= np.r_[s.ubx, s.ubu]).all(axis=1)
+    inside = (z[rows] >= low).all(axis=1) & (z[rows] <= high).all(axis=1)
     still = np.abs(linear(rows)[0]).max(axis=1) < 1e-8 if len(rows) else inside
     fine[rows] = inside & still
     return z, fine

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from nocl.functions import Stage
 from nocl.ocp import OCP
+from nocl.scales import units
 from nocl.support.checks import Array
 from nocl.translate.kernels import emit
 
@@ -50,7 +51,9 @@ def ddp_source(ocp: OCP, net: Any = None, substeps: int = 1) -> str:
         sizes |= {"ND": inputs["d"].numel(), "TIMED": int("t" in at.names), "NP": ocp.np}
     moment = list(inputs.values())
     lines = ['#include "lanes.h"', *(['#include "mlp.h"'] if nets else []),
-             *(f"#define {name} {value}" for name, value in sizes.items()), _STEP, _networks(inputs, nets),
+             *(f"#define {name} {value}" for name, value in sizes.items()),
+             f"static const double DAMPED[M] = {{{', '.join(map(repr, damped(ocp).tolist()))}}};", _STEP,
+             _networks(inputs, nets),
              emit("field", [*moment, networks], [ca.densify(stage.rhs)]),
              emit("stage_jacobian", [*moment, networks], [stage.J.T]),
              emit("network_weights", [*moment, networks, stage.mu], [stage.v]),
@@ -60,6 +63,12 @@ def ddp_source(ocp: OCP, net: Any = None, substeps: int = 1) -> str:
         lines.append(emit("stage_parameters", [*moment, networks, stage.bend, stage.mu], [stage.by_p]))
     lines += [*_terminal(ocp, inputs), '#include "ddp.h"\n']
     return "\n".join(lines)
+
+
+def damped(ocp: OCP) -> Array:
+    """What mu is multiplied by for each control, [nu]: 1 of Quu in the solver's units."""
+    of = units(ocp)
+    return of.cost / of.u**2
 
 
 def stage_inputs(at: Stage) -> dict[str, ca.SX]:

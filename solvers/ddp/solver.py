@@ -17,7 +17,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,11 +26,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nocl.data import Solution
+from nocl.functions import Functions
 from nocl.ocp import OCP
+from nocl.scales import usual_sizes
 from nocl.solvers.ddp.batch import Job, Piece, Rows, assembled, pieces
 from nocl.solvers.ddp.kernel import ddp_source, pack_weights
 from nocl.solvers.ddp.without_compiler import ddp_kernel
-from nocl.solvers.grid import measured
+from nocl.solvers.grid import fastest_at_start, firsts, measured
+from nocl.substeps import COARSE, Grid, settled
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.support.fields import Checked, count, positive
@@ -40,6 +43,7 @@ from nocl.support.pool import Journal, Pool, stream
 if TYPE_CHECKING:
     from nocl.sysid.identification import LearnedDynamics
 
+ROUNDING = 1e-15  # of the usual cost
 STAGES = 4  # evaluations of f in an RK4 step
 TOLERATED = 0.01  # of a path constraint's scale: what the penalty may leave of a violation
 GROWTH, DECAY = 4.0, 2.0  # of mu, after a failure and a success: against 8 and 8, twice as many wild starts converge
@@ -50,9 +54,11 @@ class DDPSettings(Checked):
     """When to stop, and how steps are damped."""
 
     max_iterations: int = count(200, "of the descent")
-    tolerance: float = positive(1e-10, "stop when the predicted decrease of J is below tolerance * |J| + 1e-15")
+    tolerance: float = positive(1e-10, "stop when the predicted decrease of J is below tolerance * |J|, or 1e-15 of "
+                                "the usual cost")
     smallest_step: float = positive(2.0**-12, "of the line search", most=1)
-    damping: float = positive(1e-4, "first mu added to Quu where a sweep or a line search fails")
+    damping: float = positive(1e-4, "first mu added to Quu, in the solver's units, where a sweep or a line search "
+                              "fails")
     largest_damping: float = positive(1e8, "give up above it")
 
     def __post_init__(self) -> None:
@@ -70,8 +76,9 @@ class DDP:
     ocp : OCP
     intervals : int
         K, the number of held controls on [t0, T].
-    substeps : int
-        RK4 steps in each interval; more for fast dynamics.
+    substeps : int, optional
+        RK4 steps in each interval. Default: 1, or where a few solutions from the OCP's initial states show that this is
+        too coarse for the plant, as many as they ask for (nocl/substeps.py); a warning says so.
     dynamics : LearnedDynamics, optional
         f_theta in place of the exact f; its networks' derivatives are generated C too.
     constraints : "hard" or "soft"
@@ -83,24 +90,25 @@ class DDP:
         Default: the folder that NOCL_CACHE names, or else one that goes with the process.
     """
 
-    def __init__(self, ocp: OCP, *, intervals: int = 80, substeps: int = 1, dynamics: LearnedDynamics | None = None,
-                 settings: DDPSettings | None = None, constraints: str = "hard", threads: int | None = None,
+    def __init__(self, ocp: OCP, *, intervals: int = 80, substeps: int | None = None,
+                 dynamics: LearnedDynamics | None = None, settings: DDPSettings | None = None,
+                 constraints: str = "hard", threads: int | None = None,
                  cache: str | os.PathLike[str] | None = None) -> None:
         checks.problem(ocp, "DDP")
-        for name, value in (("intervals", intervals), ("substeps", substeps),
+        for name, value in (("intervals", intervals), ("substeps", 1 if substeps is None else substeps),
                             ("threads", 1 if threads is None else threads)):
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
-                raise ValueError(f"DDP: {name} is {value!r}; expected an integer >= 1")
-        if constraints not in ("hard", "soft"):
-            raise ValueError(f"DDP: constraints is {constraints!r}; expected 'hard' or 'soft'")
+            checks.whole(value, name, "DDP", 1)
+        checks.word(constraints, ("hard", "soft"), "constraints", "DDP")
+        if settings is not None:
+            checks.instance(DDPSettings, settings, "settings", "DDP", "DDPSettings(max_iterations=...)")
         self.ocp, self.intervals, self.settings = ocp, int(intervals), settings or DDPSettings()
-        self.constraints, self.substeps = constraints, int(substeps)
+        self.constraints, self.dynamics, self.cache = constraints, dynamics, cache
         self.checked = False  # whether the grid was held against the plant
         self.threads = int(threads or os.cpu_count() or 1)
-        self.dynamics, self.cache = dynamics, cache
         self.evaluations: Counter[str] = Counter()  # of f in this process, one for each state: "rollout", "backward"
         net = None if dynamics is None else _fitting(ocp, dynamics)
         self._weights = np.zeros(1) if net is None else pack_weights(net)
+        self.substeps = int(substeps or substeps_for(ocp, dynamics, self.intervals))
         self.kernel = ddp_kernel(ocp, dynamics, cache, self.substeps)
         self._lb, self._ub = np.ascontiguousarray(ocp.system.lbu), np.ascontiguousarray(ocp.system.ubu)
 
@@ -135,6 +143,7 @@ class DDP:
         rows, _ = checks.states(x0, self.ocp.system.nx, self.ocp.system.name)
         rows = np.ascontiguousarray(rows)
         values = self.ocp.parameters_of(p, len(rows), "DDP")
+        curvature = checks.flag(curvature, "curvature", "DDP.solve")
         times, (pool, here) = self._start_times(t0, len(rows)), self._where(workers)
         guess = self._guesses(len(rows), u=u, x=x, gain=gain)
         journal = Journal(None if out is None else Path(out),
@@ -150,8 +159,7 @@ class DDP:
         if self.checked or not solution.success.any():
             return
         self.checked = True
-        f = None if self.dynamics is None else self.dynamics.to_casadi()
-        grid = measured(self.ocp, self.ocp.functions.on(f) if f else self.ocp.functions, solution, self.substeps)
+        grid = measured(self.ocp, _functions(self.ocp, self.dynamics), solution, self.substeps)
         if grid is not None and grid.coarse:
             warnings.warn(f"DDP of {self.ocp.system.name}: {grid}", stacklevel=3)
 
@@ -216,7 +224,7 @@ class DDP:
                            *(part for pair in sorted(guess.items()) for part in pair), curvature)
 
     def _start_times(self, t0: ArrayLike, B: int) -> Array:
-        given = np.asarray(t0, dtype=np.float64)
+        given = checks.numeric(t0, "t0", "DDP.solve", f"a number, or one for each of the {B} states")
         if given.shape not in ((), (1,), (B,)):
             raise ValueError(f"t0 has shape {given.shape}; expected a number, or one for each of the {B} states")
         times = np.broadcast_to(given, (B,)).copy()
@@ -224,6 +232,24 @@ class DDP:
         if bad.size:
             raise ValueError(f"t0[{bad[0]}] is {times[bad[0]]}; expected 0 <= t0 < horizon = {self.ocp.horizon}")
         return times
+
+
+@lru_cache(maxsize=32)
+def substeps_for(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int, tolerance: float = COARSE) -> int:
+    """As many as solutions from a few initial states ask for, so that they are off by `tolerance` at most."""
+    functions, (x0, p) = _functions(ocp, dynamics), firsts(ocp)
+
+    def ask(substeps: int) -> Grid | None:
+        ddp = DDP(ocp, intervals=intervals, substeps=substeps, dynamics=dynamics, constraints="soft")
+        ddp.checked = True
+        return measured(ocp, functions, ddp.solve(x0, p=p, progress=False), substeps)
+
+    return settled(f"DDP of {ocp.system.name}", ask, ocp.horizon / intervals, lambda: fastest_at_start(ocp, functions),
+                   tolerance)
+
+
+def _functions(ocp: OCP, dynamics: LearnedDynamics | None) -> Functions:
+    return ocp.functions if dynamics is None else ocp.functions.on(dynamics.to_casadi())
 
 
 @dataclass
@@ -241,6 +267,7 @@ class Work:
 
     def __post_init__(self) -> None:
         self.begin = time.perf_counter()
+        self.rounding = ROUNDING * usual_sizes(self.ddp.ocp).cost
         ocp, B, K = self.ddp.ocp, len(self.x0), self.ddp.intervals
         nx, nu = ocp.system.nx, ocp.system.nu
         self.p = np.zeros((B, 0)) if self.parameters is None else self.parameters
@@ -286,7 +313,7 @@ class Work:
             good, bad = rows[self.positive[rows] > 0], rows[self.positive[rows] == 0]
             self.refused[bad] = np.maximum(self.refused[bad], self.mu[bad])
             self._damp(bad)
-            small = -(self.slope[good] + self.curve[good]) <= s.tolerance * np.abs(self.J[good]) + 1e-15
+            small = -(self.slope[good] + self.curve[good]) <= s.tolerance * np.abs(self.J[good]) + self.rounding
             self._settle(good[small])
             self._line_search(good[~small])
 
@@ -393,7 +420,7 @@ def _fitting(ocp: OCP, dynamics: LearnedDynamics) -> Any:
 
 
 def _shaped(value: Array, shape: tuple[int, ...], name: str) -> Array:
-    array = np.ascontiguousarray(value, dtype=np.float64)
+    array = np.ascontiguousarray(checks.numeric(value, f"the guess {name}", "DDP", f"{list(shape)}", copy=False))
     if array.shape != shape:
         raise ValueError(f"DDP: the guess {name} has shape {array.shape}; expected {shape}, a row for each x0")
     return array

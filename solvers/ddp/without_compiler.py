@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nocl.ocp import OCP
-from nocl.solvers.ddp.kernel import ddp_source
+from nocl.solvers.ddp.kernel import damped, ddp_source
 from nocl.support.checks import Array
 from nocl.support.compiler import NoCompilerError
 from nocl.translate.kernels import Kernel
@@ -52,6 +52,7 @@ class NumpyKernel:
         h, lam = at.sym("h"), at.sym("lam", ocp.system.nx)
         after, cost = at.interval(h, substeps=substeps)
         H, g = ca.hessian(ca.dot(lam, after) + cost, at.z)[0], ca.gradient(cost, at.z)
+        self.damped = np.diag(damped(ocp))
         self._step, self._terminal = of.step(substeps=substeps), of.G_derivatives
         by_p = {"Q_p": ca.gradient(ca.dot(lam, after) + cost, at["p"])} if self.np else {}
         self._slopes = at.function("slopes", {"cost": cost, "F_z": ca.jacobian(after, at.z), "cost_z": g, "Q_zz": H,
@@ -109,7 +110,7 @@ class NumpyKernel:
             F, H = (a.reshape(len(b), n + m, -1).transpose(0, 2, 1) for a in (F, H))  # CasADi stores columns
             Q, q = H + F.transpose(0, 2, 1) @ P @ F, l + np.einsum("bij,bi->bj", F, p)
             Quu, Qux, qu = Q[:, n:, n:], Q[:, n:, :n], q[:, n:]
-            damped, low, high = Quu + mu[b, None, None] * np.eye(m), lb - u[b, t - 1], ub - u[b, t - 1]
+            damped, low, high = Quu + mu[b, None, None] * self.damped, lb - u[b, t - 1], ub - u[b, t - 1]
             step, held, L, ok = boxed_newton(damped, qu, low, high)
             K_t = substitute(L, np.where(held[:, :, None], 0.0, -Qux))
             good &= ok

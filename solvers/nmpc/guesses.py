@@ -6,11 +6,12 @@ import casadi as ca
 import numpy as np
 
 from nocl.data import Controller
-from nocl.judge import takes_p
+from nocl.judge import answer_of, takes_p
 from nocl.ocp import OCP
 from nocl.solvers.lqr import LQR
 from nocl.solvers.nmpc.transcription import Transcription
 from nocl.solvers.starts import HALVINGS, near, random_controls
+from nocl.support import checks
 from nocl.support.checks import Array
 
 Guess = tuple[Array, Array]
@@ -87,7 +88,10 @@ def controller_rollout(program: Transcription, controller: Controller, x0: Array
     x, u = np.tile(x0, (N + 1, 1)), np.tile(ocp.u_goal if p is None else ocp.goals(p[None])[1], (N, 1))
     more = [p] if takes_p(ocp, controller) else []
     for k in range(N):
-        answer = np.asarray(controller(x[k], float(t[k]), *more), dtype=np.float64)
+        answer = checks.numeric(answer_of(controller, x[k], float(t[k]), *more), "the guess's answer", "NMPC",
+                                f"u [{s.nu}]")
+        if answer.size != s.nu:
+            raise ValueError(f"NMPC: the guess's answer has shape {answer.shape}; expected u [{s.nu}]")
         control = np.clip(answer.reshape(s.nu), s.lbu, s.ubu)
         end = program.stepped(x[k], control, t, k, p)
         if not (np.isfinite(control).all() and np.isfinite(end).all()):

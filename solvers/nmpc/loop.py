@@ -46,8 +46,9 @@ class Loop:
     """
 
     def __init__(self, nmpc: Planner, hold: int | None = None, receding: bool = False) -> None:
-        if hold is not None and (isinstance(hold, bool) or not isinstance(hold, (int, np.integer)) or hold < 1):
-            raise ValueError(f"hold is {hold!r}; expected how many controls the horizon has, an integer >= 1")
+        if hold is not None:
+            checks.whole(hold, "hold, how many controls the horizon has,", "NMPC.controller", 1)
+        receding = checks.flag(receding, "receding", "NMPC.controller")
         if receding and nmpc.ocp.uses_time:
             raise ValueError("a receding window begins at t = 0 anew at each call, but the problem holds the time t; "
                              "expected one without, or receding=False")

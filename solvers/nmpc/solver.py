@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from nocl.data import Solution, Trajectory
 from nocl.judge import check_made_for, dynamics_function
 from nocl.ocp import OCP
-from nocl.solvers.grid import measured
+from nocl.solvers.grid import fastest_at_start, measured
 from nocl.solvers.lqr import LQR
 from nocl.solvers.mirrors import Mirror, mirrors
 from nocl.solvers.nmpc import guesses as starting
@@ -29,6 +29,7 @@ from nocl.solvers.nmpc.sensitivity import cost_to_go, dense, second_variation
 from nocl.solvers.nmpc.tasks import Outcome, Task, attempt, failure, outside, solved_by, violated_start
 from nocl.solvers.nmpc.transcription import BACKENDS, Answer, Transcription
 from nocl.solvers.search import Found, Moves, Rows, Search
+from nocl.substeps import Grid, settled
 from nocl.support import checks, compiler
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
@@ -47,7 +48,8 @@ class NMPC:
     intervals : N
     dynamics : casadi.Function (x, u[, t][, p]) -> xdot, or an object with `to_casadi()`; default: the exact f
     solver : "fatrop" (fast) or "ipopt" (reference); another nlpsol of CasADi's by its name
-    substeps : RK4 steps in each interval
+    substeps : RK4 steps in each interval; default: 1, or where the first solutions show that this is too coarse for the
+        plant, as many as they ask for (nocl/substeps.py); a warning says so
     horizon : length of the window that is optimised, at most the OCP's horizon T (default); it ends at T at the latest
     terminal : cost at the window's end in place of G: a casadi.Function (x), (x, t) or (x, t, p) -> number, or an
         object with `value_to_casadi()`, such as a trained value function
@@ -72,7 +74,7 @@ class NMPC:
     intervals: int = 80
     dynamics: Any = field(default=None, kw_only=True)
     solver: str = field(default="fatrop", kw_only=True)
-    substeps: int = field(default=1, kw_only=True)
+    substeps: int | None = field(default=None, kw_only=True)
     horizon: float | None = field(default=None, kw_only=True)
     terminal: Any = field(default=None, kw_only=True)
     starts: int = field(default=8, kw_only=True)
@@ -87,16 +89,19 @@ class NMPC:
     def __post_init__(self) -> None:
         checks.problem(self.ocp, "NMPC")
         for name, least in (("intervals", 2), ("substeps", 1), ("starts", 1), ("passes", 0), ("neighbours", 1)):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < least:
-                raise ValueError(f"NMPC: {name} is {value!r}; expected an integer >= {least}")
-        if self.constraints not in ("hard", "soft"):
-            raise ValueError(f"NMPC: constraints is {self.constraints!r}; expected 'hard' or 'soft'")
-        if self.solver not in BACKENDS and not ca.has_nlpsol(self.solver):
+            if name != "substeps" or self.substeps is not None:
+                checks.whole(getattr(self, name), name, "NMPC", least)
+        checks.whole(self.seed, "seed", "NMPC", most=2**63)
+        checks.word(self.constraints, ("hard", "soft"), "constraints", "NMPC")
+        if not isinstance(self.solver, str) or (self.solver not in BACKENDS and not _known(self.solver)):
             raise ValueError(f"NMPC: solver is {self.solver!r}; expected {' or '.join(BACKENDS)}, or an nlpsol "
                              "that this CasADi has")
-        if self.compiled == "" or not isinstance(self.compiled, (bool, str, os.PathLike)):
-            raise ValueError(f"NMPC: compiled is {self.compiled!r}; expected True, False, or a folder")
+        if not isinstance(self.compiled, bool):
+            checks.folder(self.compiled, "compiled (True, False, or a folder)", "NMPC")
+        if self.options is not None and not (isinstance(self.options, Mapping)
+                                             and all(isinstance(key, str) for key in self.options)):
+            raise ValueError(f"NMPC: options is {checks.shown(self.options)}; expected a dict of options of the "
+                             'nlpsol by name, like {"ipopt.tol": 1e-6}')
         if checks.number(self.window, "horizon", "NMPC", positive=True) > self.ocp.horizon:
             raise ValueError(f"NMPC: horizon is {self.horizon!r}; expected at most {self.ocp.horizon:g}, the OCP's")
         if self.time_limit is not None:
@@ -118,12 +123,30 @@ class NMPC:
         """A fingerprint of the program: of the problem, models and settings that it is built from."""
         options = sorted((self.options or {}).items())
         return fingerprint(self.ocp.to_data(), self.dynamics, self.terminal,
-                           int(self.intervals), int(self.substeps), self.constraints, self.solver, options)
+                           int(self.intervals), int(self.substeps or 0), self.constraints, self.solver, options)
 
-    @cached_property
+    @property
     def program(self) -> Transcription:
         """The nonlinear program, built once for each problem and settings."""
+        return self.settled._program
+
+    @cached_property
+    def _program(self) -> Transcription:
         return shared_program(_Recipe(f"{self.key}{self._folder or ''}", self))
+
+    @property
+    def settled(self) -> NMPC:
+        """This one, its substeps a number: those that its solutions so far have asked for, 1 before there are any."""
+        return self if self.substeps is not None else self._with(self._with(1)._program.settled.get("substeps", 1))
+
+    def _with(self, substeps: int) -> NMPC:
+        if substeps not in self._others:
+            self._others[substeps] = replace(self, substeps=substeps)
+        return self._others[substeps]
+
+    @cached_property
+    def _others(self) -> dict[int, NMPC]:
+        return {}
 
     @property
     def _folder(self) -> Path | None:
@@ -169,31 +192,55 @@ class NMPC:
         tried = [one for one in (guesses if isinstance(guesses, list) else [guesses]) if one is not None]
         tried.sort(key=lambda one: not _is_solution(one))
         given, warm = [_given(one, self, rows, t, values) for one in tried], sum(map(_is_solution, tried))
-        n = starts if starts is not None else (0 if given else self.starts)
+        n = checks.whole(starts, "starts", "NMPC.solve") if starts is not None else (0 if given else self.starts)
+        gains = checks.flag(gains, "gains", "NMPC.solve")
         if n < 1 and not given:
             raise ValueError(f"starts is {n}; expected at least 1, or guesses")
         show = sys.stderr.isatty() if progress is None else progress
-        key = self._run_key(rows, t, values, given, n, warm) if out else ""
-        journal = Journal(None if out is None else Path(out), key)
-        states = _States(self, rows, t, values, given, warm, Pool(workers), journal, show)
-        rounds = self.passes if n else 0
-        search = Search(states, self.ocp, self.mirrors if rounds else [], rows, t, neighbours=self.neighbours,
-                        rounds=rounds, seed=self.seed, p=values)
-        search.stage("NMPC", search.cold, np.arange(len(rows)), 0, n)
-        search.improve(n)
-        solution = states.finished(search.solution())
-        self._check_grid(solution)
+        call = _Call(rows, t, values, given, warm, n, Pool(workers), None if out is None else Path(out), show)
+        solution = self._settle(call) if self.substeps is None else self._told(self._search(call))
         return self.with_gains(solution) if gains else solution
 
-    def _check_grid(self, solution: Solution) -> None:
-        """Warns, once for each program, where the first solutions show a grid that is too coarse."""
+    def _settle(self, call: _Call) -> Solution:
+        """Solved with as few substeps as the first solutions are right with, which is remembered.
+
+        In a folder all that is asked there begins with 1, so that the same call finds what it left.
+        """
+        known = self._with(1)._program.settled
+        if "substeps" in known and call.out is None:
+            return self.settled._search(call)
+        found = dict[int, Solution]()
+
+        def ask(substeps: int) -> Grid | None:
+            s = found[substeps] = self._with(substeps)._search(call.within(substeps))
+            return measured(self.ocp, self._with(substeps)._program.functions, s, substeps)
+
+        functions, step = self._with(1)._program.functions, float(np.diff(call.t).max())
+        substeps = settled(f"NMPC of {self.ocp.system.name}", ask, step, lambda: fastest_at_start(self.ocp, functions))
+        if any(s.success.any() for s in found.values()):
+            known["substeps"] = substeps
+        return found[substeps]
+
+    def _told(self, solution: Solution) -> Solution:
+        """The same; a warning, once for each program, where the first solutions show a grid that is too coarse."""
         p = self.program
-        if p.checked or self.terminal is not None or not solution.success.any():
-            return
-        p.checked.append(True)
-        grid = measured(self.ocp, p.functions, solution, self.substeps)
-        if grid is not None and grid.coarse:
-            warnings.warn(f"NMPC of {self.ocp.system.name}: {grid}", stacklevel=3)
+        if "substeps" not in p.settled and solution.success.any():
+            p.settled["substeps"] = p.substeps
+            grid = measured(self.ocp, p.functions, solution, p.substeps)
+            if grid is not None and grid.coarse:
+                warnings.warn(f"NMPC of {self.ocp.system.name}: {grid}", stacklevel=3)
+        return solution
+
+    def _search(self, call: _Call) -> Solution:
+        """Solved with this number of substeps."""
+        key = self._run_key(call.x0, call.t, call.p, call.given, call.starts, call.warm) if call.out else ""
+        states = _States(self, call, Journal(call.out, key))
+        rounds = self.passes if call.starts else 0
+        search = Search(states, self.ocp, self.mirrors if rounds else [], call.x0, call.t, neighbours=self.neighbours,
+                        rounds=rounds, seed=self.seed, p=call.p)
+        search.stage("NMPC", search.cold, np.arange(len(call.x0)), 0, call.starts)
+        search.improve(call.starts)
+        return states.finished(search.solution())
 
     def with_gains(self, solution: Solution) -> Solution:
         """A Solution of this NMPC with its feedback `gain` and `V_xx`.
@@ -219,9 +266,9 @@ class NMPC:
 
     def _nodes(self, t0: float, nodes: ArrayLike | None) -> Array:
         T, N = self.ocp.horizon, self.intervals
-        if not 0 <= t0 < T:
-            raise ValueError(f"t0 is {t0!r}; expected 0 <= t0 < {T:g}, the horizon")
-        t = np.linspace(t0, min(t0 + self.window, T), N + 1) if nodes is None else np.asarray(nodes, dtype=np.float64)
+        t0 = checks.start_time(t0, T)
+        t = np.linspace(t0, min(t0 + self.window, T), N + 1) if nodes is None else \
+            checks.array(nodes, [N + 1], "nodes", "NMPC.solve")
         if t.shape != (N + 1,) or not (np.diff(t) > 0).all() or t[0] < 0 or t[-1] > T * (1 + 1e-9):
             raise ValueError(f"nodes have shape {t.shape}; expected N + 1 = {N + 1} rising times in [0, {T:g}]")
         if self.horizon is None and t[-1] < T * (1 - 1e-9):
@@ -235,9 +282,17 @@ class NMPC:
                            version("casadi"), version("nocl"))
 
 
-def closed_loop(ocp: OCP, intervals: int, seed: int) -> Loop:
+def _known(solver: str) -> bool:
+    """Whether this CasADi has an nlpsol of that name."""
+    try:
+        return bool(solver.isidentifier() and ca.has_nlpsol(solver))
+    except RuntimeError:
+        return False
+
+
+def closed_loop(ocp: OCP, intervals: int, seed: int, substeps: int | None = None) -> Loop:
     """NMPC as feedback, as the command line makes it."""
-    return NMPC(ocp, intervals, seed=seed).controller()
+    return NMPC(ocp, intervals, seed=seed, substeps=substeps).controller()
 
 
 @dataclass(frozen=True)
@@ -251,7 +306,7 @@ class _Recipe:
 @lru_cache(maxsize=KEPT)
 def shared_program(recipe: _Recipe) -> Transcription:
     m = recipe.nmpc
-    return Transcription(m.ocp, dynamics_function(m.ocp, m.dynamics), int(m.intervals), int(m.substeps),
+    return Transcription(m.ocp, dynamics_function(m.ocp, m.dynamics), int(m.intervals), int(m.substeps or 1),
                          m.constraints == "soft", m.solver, tuple(sorted((m.options or {}).items())), m.terminal,
                          None if m._folder is None else (m.key, m._folder))
 
@@ -279,6 +334,25 @@ def _terminal(ocp: OCP, terminal: Any) -> ca.Function | None:
     return g
 
 
+@dataclass(frozen=True, eq=False)
+class _Call:
+    """One call of solve, checked."""
+
+    x0: Array  # [B, nx]
+    t: Array  # [N+1]
+    p: Array  # [B, np]
+    given: list[list[Guess]]
+    warm: int  # how many of these, the first ones, are solutions
+    starts: int
+    pool: Pool
+    out: Path | None
+    show: bool
+
+    def within(self, substeps: int) -> _Call:
+        """The same, what it keeps in a folder of its own for more substeps than 1."""
+        return self if substeps == 1 or self.out is None else replace(self, out=self.out / f"substeps-{substeps}")
+
+
 @dataclass(frozen=True)
 class _Job:
     """What a worker does with a task."""
@@ -300,12 +374,11 @@ class _Job:
 class _States:
     """The states of one call of solve, as a search asks for them: a task for each state and stage."""
 
-    def __init__(self, nmpc: NMPC, x0: Array, t: Array, p: Array, given: list[list[Guess]], warm: int, pool: Pool,
-                 journal: Journal, show: bool) -> None:
-        self.nmpc, self.x0, self.t, self.p, self.given, self.warm = nmpc, x0, t, p, given, warm
-        self.pool, self.journal, self.show = pool, journal, show
-        self.refusal = [violated_start(nmpc.program, x, t[0], own) for x, own in zip(x0, p, strict=True)]
-        self.failed: list[Answer | None] = [None] * len(x0)  # of each state's solves that failed, by rank
+    def __init__(self, nmpc: NMPC, call: _Call, journal: Journal) -> None:
+        self.nmpc, self.call, self.journal = nmpc, call, journal
+        self.x0, self.t, self.p = call.x0, call.t, call.p
+        self.refusal = [violated_start(nmpc.program, x, self.t[0], p) for x, p in zip(self.x0, self.p, strict=True)]
+        self.failed: list[Answer | None] = [None] * len(self.x0)  # of each state's solves that failed, by rank
 
     def begin(self, stage: int, what: str) -> None:
         self.number, self.what = stage - 1, what
@@ -313,9 +386,9 @@ class _States:
     def cold(self, rows: Rows, first: int, count: int) -> Found:
         """The first time also the guesses that solve was given."""
         name, begun = (f"fresh-{self.number}", True) if self.number else ("start", False)
-        tasks = [Task(f"{name}-{i:06d}", i, self.x0[i], self.t, () if begun else [guess[i] for guess in self.given],
-                      0 if begun else self.warm, first, count, self.nmpc.seed, self.nmpc.time_limit,
-                      p=self._own(i)) for i in rows]
+        given, warm = ([], 0) if begun else (self.call.given, self.call.warm)
+        tasks = [Task(f"{name}-{i:06d}", i, self.x0[i], self.t, [guess[i] for guess in given], warm, first, count,
+                      self.nmpc.seed, self.nmpc.time_limit, p=self._own(i)) for i in rows]
         return self._do(tasks)
 
     def _own(self, i: int) -> Array | None:
@@ -333,7 +406,7 @@ class _States:
 
     def _do(self, tasks: Sequence[Task]) -> Found:
         tasks = [task for task in tasks if not self.refusal[task.row]]
-        outcomes = do(_Job(self.nmpc), tasks, self.pool, self.journal, self.show, self.what)
+        outcomes = do(_Job(self.nmpc), tasks, self.call.pool, self.journal, self.call.show, self.what)
         for outcome in outcomes:
             best, failed = self.failed[outcome.row], outcome.failed
             if failed is not None and (best is None or failed.rank < best.rank):
@@ -363,6 +436,8 @@ def _given(guess: Any, nmpc: NMPC, x0: Array, t: Array, p: Array) -> list[Guess]
     """A user's guess, checked: states and controls for each x0."""
     s, N, B = nmpc.ocp.system, nmpc.intervals, len(x0)
     check_made_for(nmpc.ocp, guess, "NMPC: the guess")
+    if isinstance(guess, tuple) and len(guess) != 2:
+        raise ValueError(f"NMPC: the guess is a tuple of {len(guess)}; expected (x [B, N+1, nx], u [B, N, nu])")
     if callable(guess) and not isinstance(guess, Solution):
         return [starting.controller_rollout(nmpc.program, guess, row, t, own)
                 for row, own in zip(x0, p, strict=True)]
@@ -380,7 +455,7 @@ def _rollout(program: Transcription, x0: Array, u: Array, t: Array, p: Array) ->
 
 
 def _shaped(value: ArrayLike, shape: tuple[int, ...], what: str, form: str) -> Array:
-    array = np.asarray(value, dtype=np.float64)
+    array = checks.numeric(value, what, "NMPC", f"{form} = {list(shape)}", copy=False)
     if array.ndim == 2 and shape[0] == 1:
         array = array[None]
     if array.shape != shape:

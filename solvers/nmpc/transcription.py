@@ -20,7 +20,7 @@ import numpy as np
 
 from nocl.functions import Functions
 from nocl.ocp import OCP
-from nocl.scales import steps, usual_sizes
+from nocl.scales import steps, units
 from nocl.support import compiler
 from nocl.support.checks import Array
 from nocl.support.guard import Guarded, NoAnswerError
@@ -180,11 +180,11 @@ class Transcription:
     @cached_property
     def scales(self) -> Scales:
         """The sizes that the solver sees as 1, in steps of about a thousand: most problems are solved as they stand."""
-        N, usual = self.N, usual_sizes(self.ocp)
-        x, u, cost = (steps(size) for size in (usual.x, usual.u, usual.cost))
+        N, of = self.N, units(self.ocp)
+        x, u = of.x, of.u
         h = steps(self.ocp.constraint_scales) if self.n_path else np.zeros(0)
         w = np.r_[np.tile(np.r_[x, u], N), x]
-        return Scales(w, np.r_[x, x, np.tile(np.r_[h, x], N - 1), h], float(cost), x)
+        return Scales(w, np.r_[x, x, np.tile(np.r_[h, x], N - 1), h], of.cost, x)
 
     def split(self, w: Any) -> tuple[Any, Any]:
         """(X [nx, N+1], U [nu, N]) of the interleaved variables."""
@@ -261,8 +261,7 @@ class Transcription:
             answer: Answer = self._guarded(self.patience if time_limit is None else time_limit, x0, t, x, u,
                                             np.zeros(0) if p is None else p)
         except NoAnswerError as error:
-            return Answer(x, u, np.full_like(x, np.nan), np.inf, False, f"{self.backend} was given up: {error}", np.inf,
-                          0, GIVEN_UP)
+            return self._no_answer(x, u, f"was given up: {error}")
         self._took[0] = max(self._took[0], time.perf_counter() - begin)
         return answer
 
@@ -278,14 +277,19 @@ class Transcription:
         return [0.0]  # seconds of the slowest solve that came back
 
     @cached_property
-    def checked(self) -> list[bool]:
-        """Not empty once its grid was held against the plant."""
-        return []
+    def settled(self) -> dict[str, int]:
+        """`substeps` that its first solutions have asked for, once they were held against the plant."""
+        return {}
 
     @cached_property
     def _guarded(self) -> Guarded:
         self.solver  # noqa: B018 - built here, the copies have it
-        return Guarded(self._solve)
+        return Guarded(self._solve, self._rehearse)
+
+    def _rehearse(self) -> None:
+        for name in self.solver.get_function():
+            _at_zero(self.solver.get_function(name))
+        self.split(ca.DM.zeros(self.solver.sparsity_in(0)))
 
     @cached_property
     def _evaluation(self) -> float:
@@ -296,15 +300,22 @@ class Transcription:
         hessian, took = self.solver.get_function(name), list[float]()
         for _ in range(TIMED):
             begin = time.perf_counter()
-            hessian(*(ca.DM.zeros(hessian.sparsity_in(i)) for i in range(hessian.n_in())))
+            _at_zero(hessian)
             took.append(time.perf_counter() - begin)
         return min(took)
+
+    def _no_answer(self, x: Array, u: Array, why: str) -> Answer:
+        """A failure of the solver itself, which leaves the guess."""
+        return Answer(x, u, np.full_like(x, np.nan), np.inf, False, f"{self.backend} {why}", np.inf, 0, GIVEN_UP)
 
     def _solve(self, x0: Array, t: Array, x: Array, u: Array, own: Array) -> Answer:
         w0 = np.r_[np.c_[x[:-1], u].ravel(), x[-1]]
         solver, p = self.solver, np.r_[x0, np.diff(t), t[-1], own]
         scales = self.scales
-        result = solver(x0=w0 / scales.w, p=p, **self._limits)
+        try:
+            result = solver(x0=w0 / scales.w, p=p, **self._limits)
+        except RuntimeError as error:  # of the library: it fails one start, not the batch
+            return self._no_answer(x, u, f"ended with an error: {str(error).strip().splitlines()[-1]}")
         stats = solver.stats()
         X, U = (v.full().T for v in self.split(result["x"] * scales.w))
         U = np.clip(U, self.ocp.system.lbu, self.ocp.system.ubu)  # IPOPT relaxes bounds by 1e-8
@@ -312,14 +323,17 @@ class Transcription:
         worst, where = self.violation(result["g"].full().ravel(), t)
         iterations = int(stats.get("iter_count", 0))
         outcome = outcome_of(stats, iterations >= self.max_iter)
+        cost = float(result["f"]) * scales.cost
+        finite = bool(np.isfinite(cost) and np.isfinite(X).all())
+        if stats["success"] and not finite:  # fatrop calls a cost of NaN solved
+            outcome = NOT_A_NUMBER
         status = words(stats, outcome)
-        success = bool(stats["success"] and worst <= FEASIBLE and np.isfinite(X).all())
+        success = bool(stats["success"] and worst <= FEASIBLE and finite)
         if not success:
             status += f"; worst violation {where}" if worst > FEASIBLE else \
                 ", at a feasible point that may not be optimal"
-        cost = float(result["f"]) * scales.cost if success else np.inf
         V_p = -result["lam_p"].full().ravel()[len(p) - len(own):] * scales.cost if len(own) else None
-        return Answer(X, U, costate, cost, success, status, worst, iterations, outcome, V_p)
+        return Answer(X, U, costate, cost if success else np.inf, success, status, worst, iterations, outcome, V_p)
 
     @property
     def max_iter(self) -> float:
@@ -351,6 +365,10 @@ class Transcription:
             i = int(np.flatnonzero(path == row)[0])
             node, what = 1 + i // self.n_path, f"path constraint {list(self.ocp.path_constraints)[i % self.n_path]!r}"
         return float(excess[row]), f"{excess[row] * self.scales.g[row]:.3g} of {what} at node {node}, t = {t[node]:.4g}"
+
+
+def _at_zero(function: ca.Function) -> None:
+    function(*(ca.DM.zeros(function.sparsity_in(i)) for i in range(function.n_in())))
 
 
 def outcome_of(stats: dict[str, Any], limited: bool = False) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from datetime import date, datetime, timedelta
 from numbers import Real
 from pathlib import Path
@@ -22,7 +22,7 @@ NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?")
 
 def rows_of(value: Any, n: int, names: Sequence[str], what: str, owner: str) -> Array:
     """[n, len(names)] float64."""
-    columns = getattr(value, "columns", None)
+    columns = getattr(value, "columns", None) if hasattr(value, "dtypes") else None
     if columns is not None and list(columns) != list(names):
         raise ValueError(f"{owner}: {what} has the columns {', '.join(map(str, columns))}; expected "
                          f"{', '.join(names)}: pass {what}[[{', '.join(map(repr, names))}]]")
@@ -45,9 +45,14 @@ def _real(value: Any, what: str, owner: str) -> Array:
 
 def seconds(t: Any, owner: str) -> Array:
     """Times [N]: numbers as they are, timestamps in seconds from the first, durations in seconds."""
-    array = np.asarray(t)
+    try:
+        array = np.asarray(t)
+    except Exception:  # whatever its own conversion raises
+        array = np.zeros((0, 0))
     if array.ndim != 1:
-        raise ValueError(f"{owner}: t has shape {array.shape}; expected one time for each sample, [N]")
+        raise ValueError(f"{owner}: t is {checks.shown(t)}; expected one time for each sample, [N]")
+    if np.datetime_data(array.dtype)[0] in ("Y", "M") if array.dtype.kind in "mM" else False:
+        raise ValueError(f"{owner}: t is {checks.shown(t)}, in whole months or years; expected seconds, or timestamps")
     if array.dtype.kind in "mM":
         return (array - array[:1].astype(array.dtype) if array.dtype.kind == "M" else array) / np.timedelta64(1, "s")
     values = array.tolist()
@@ -99,11 +104,21 @@ def _number(cell: Any, i: int, name: str, path: str | Path) -> float:
                      "empty cells where a sample is missing: remove lines of units, and separators of thousands")
 
 
+def _listed(run: Any) -> Any:
+    """A column of another library as a list, or None."""
+    try:
+        return list(np.asarray(run).tolist())
+    except Exception:  # whatever its own conversion raises
+        return None
+
+
 def labels_of(run: Any, n: int, owner: str) -> list[str]:
     """A label for each sample; ValueError for missing ones, and for text among numbers."""
     if run is None:
         return ["0"] * n
-    values = run.tolist() if hasattr(run, "tolist") else list(run) if isinstance(run, Iterable) else [run]
+    values = run.tolist() if isinstance(run, np.ndarray) else run if isinstance(run, (list, tuple)) else \
+        _listed(run)
+    values = list(values) if isinstance(values, tuple) else values
     if not isinstance(values, list) or len(values) != n:
         shape = (len(values),) if isinstance(values, list) else ()
         raise ValueError(f"{owner}: run has shape {shape}; expected ({n},), a label for each sample")

@@ -69,8 +69,7 @@ class Log:
         Raises ValueError for wrong shapes, times that do not rise within a run, values that cannot be (far outside the
         system's box, angles in degrees, times in another unit than derivatives), and logs without a usable piece.
         """
-        if not isinstance(system, System):
-            raise ValueError(f"Log: system is a {type(system).__name__}; expected a nocl.System")
+        checks.instance(System, system, "system", "Log", "of an OCP, pass ocp.system")
         owner = f"log of {system.name!r}"
         times = seconds(t, owner)
         n = len(times)
@@ -87,8 +86,9 @@ class Log:
         Other columns are left aside. t is in seconds, or timestamps (ISO 8601 in CSV). Parquet takes pyarrow: pip
         install 'nocl[data]'. ValueError for what is missing, and as in `of`.
         """
+        checks.instance(System, system, "system", "Log", "of an OCP, pass ocp.system")
         _check_names(system.state_names, system.control_names)
-        table = read_table(Path(path))
+        table = read_table(checks.folder(path, "path", "Log.read"))
         needed = [TIME, *system.names]
         missing = [name for name in needed if name not in table]
         if missing:
@@ -122,10 +122,12 @@ class Log:
         if all(r.xdot is not None for r in self.runs):
             xdot = np.concatenate([r.xdot for r in self.runs if r.xdot is not None])
             columns |= {f"d{name}/dt": xdot[:, i] for i, name in enumerate(self.states)}
-        return write_table(Path(path), columns)
+        return write_table(checks.folder(path, "path", "Log.write"), columns)
 
     def split(self, share: float = 0.2, seed: int = 0) -> tuple[Log, Log]:
         """(training, test): whole recordings, about `share` of them at random for the test, at least one in each."""
+        rng = checks.generator(seed, "Log.split")
+        share = checks.between(share, 0.0, 1.0, "share", "Log.split")
         names = sorted({r.run for r in self.runs})
         if len(names) < 2:
             raise ValueError(f"the log has {counted(len(names), 'recording')}; expected 2 or more to split by "
@@ -133,12 +135,13 @@ class Log:
         if not 0 < share < 1:
             raise ValueError(f"share is {share!r}; expected a number between 0 and 1")
         n = min(max(round(share * len(names)), 1), len(names) - 1)
-        test = {names[i] for i in np.random.default_rng(seed).permutation(len(names))[:n]}
+        test = {names[i] for i in rng.permutation(len(names))[:n]}
         train, held = [r for r in self.runs if r.run not in test], [r for r in self.runs if r.run in test]
         return replace(self, runs=tuple(train), left_out=0), replace(self, runs=tuple(held), left_out=0)
 
     def check(self, system: System) -> None:
         """ValueError where the log is of other states and controls than the system's."""
+        checks.instance(System, system, "system", "Log.check", "of an OCP, pass ocp.system")
         if (self.states, self.controls) != (system.state_names, system.control_names):
             raise ValueError(f"the log has {', '.join(self.states + self.controls)}; {system.name!r} has "
                              f"{', '.join(system.names)}: read the log for this system")

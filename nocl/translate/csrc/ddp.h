@@ -343,7 +343,7 @@ static void value_update(lane Q[NZ][NZ], const lane *q, const lane *k, lane gain
     }
 }
 
-/* The Riccati sweep about (x, u). Writes k, gain, slope = sum k'q, curve = sum k'Q k / 2, whether every Quu + mu I was
+/* The Riccati sweep about (x, u). Writes k, gain, slope = sum k'q, curve = sum k'Q k / 2, whether every Quu + mu D was
    positive, and, where asked for (not NULL), V [B, K+1], V_x [B, K+1, N], V_xx [B, K+1, N, N]; with parameters V_p [B, NP],
    the gradient of the trajectory's cost, which is that of the optimum's. */
 void nocl_backward(int64_t first, int64_t last, const int64_t *index, int64_t K, const double *weights,
@@ -377,7 +377,7 @@ void nocl_backward(int64_t first, int64_t last, const int64_t *index, int64_t K,
             LATER(begin, (double)(t - 1) * h, now)
             V[0] += interval(weights, x, u, NOW h, Vx, Vxx, Q, q BY_P);
             for (int i = 0; i < M; ++i)
-                for (int j = 0; j < M; ++j) Quu[i][j] = Q[N + i][N + j] + (i == j ? reg : (lane){0});
+                for (int j = 0; j < M; ++j) Quu[i][j] = Q[N + i][N + j] + (i == j ? reg * DAMPED[i] : (lane){0});
             positive &= boxed_newton(Quu, q + N, u, lb, ub, held, k, L);
             feedback(L, Q, held, gain);
             for (int j = 0; j < M; ++j) {
