@@ -28,7 +28,7 @@ test-slow: lint
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "not mission"
 
 mission: set-up
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadgroup tests/mission
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto tests/mission
 
 pretrained: set-up
 	$(BIN)/python benchmarks/controllers.py --seeds 0 --keep nocl/pretrained --results pretrained

@@ -1,11 +1,12 @@
 """Dynamics from logged trajectories alone: how far ahead they predict, and what a controller trained on them does.
 
-    python benchmarks/logged.py acrobot|options|pendulum
+    python benchmarks/logged.py acrobot|options|pendulum|unstable
 
 acrobot   recordings of the simulated acrobot, 50 Hz, random controls, normal noise of 0.01 rad and 0.01 rad/s
 options   the simulated pendulum with noise of 0.02, by what is stated and how it is fitted
 pendulum  Gymnasium's Pendulum-v1 as the plant: its observations are logged, its equations are never shown; a controller
           is trained on what was learned, and run on it
+unstable  recordings of Gymnasium's InvertedPendulum-v5 in tests/data, no noise, forces that jump at every sample
 """
 
 from __future__ import annotations
@@ -194,7 +195,24 @@ def run_pendulum() -> None:
     provenance.write("logged_pendulum", [row])
 
 
+def run_unstable() -> None:
+    """By what is stated and how it is fitted; the defaults otherwise."""
+    names = ("x", "theta", "v", "omega")
+    plant = nocl.System("inverted_pendulum", x=ca.vertcat(*map(ca.SX.sym, names)), u=ca.SX.sym("a"), xdot=None,
+                        lbu=[-3], ubu=[3], lbx=[-1, -0.3, -4, -4], ubx=[1, 0.3, 4, 4], angles=["theta"])
+    log = Log.read(Path(__file__).parent.parent / "tests" / "data" / "inverted_pendulum.csv", plant)
+    train, test = log.split(0.2)
+    both: dict[str, Any] = {"known": {"x": "v", "theta": "omega"}, "control_affine": True}
+    rows = []
+    for name, options in {"nothing": {}, "both": both,
+                          "both, derivatives only": both | {"settings": LogSettings(steps=0)}}.items():
+        model, row = learned(plant, train, test, None, **options)
+        rows.append({"stated": name, "windows": model.card["windows"], **row})
+        provenance.write("logged_unstable", rows)
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("what", choices=("acrobot", "options", "pendulum"))
-    {"acrobot": run_acrobot, "options": run_options, "pendulum": run_pendulum}[parser.parse_args().what]()
+    parser.add_argument("what", choices=("acrobot", "options", "pendulum", "unstable"))
+    {"acrobot": run_acrobot, "options": run_options, "pendulum": run_pendulum,
+     "unstable": run_unstable}[parser.parse_args().what]()

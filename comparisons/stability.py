@@ -23,6 +23,7 @@ from nocl.comparisons.report.results import (
 )
 from nocl.judge import policy_function
 from nocl.ocp import OCP
+from nocl.scales import usual_sizes
 from nocl.solvers.ddp.solver import DDP
 from nocl.solvers.lqr import LQR
 from nocl.support.checks import Array
@@ -63,19 +64,19 @@ def local(ocp: OCP, name: str, policy: ca.Function, where: str, t: float, x: Arr
     A, K = (np.array([part[i].full() for part in parts]) for i in (1, 2))
     if not np.isfinite(A).all():
         return None
-    growth = np.array([_growth(loop, row, t, ocp.horizon) for row in x])
+    growth = np.array([_growth(loop, row, t, ocp.horizon, usual_sizes(ocp).x) for row in x])
     return Stability(name, where, t, _eigenvalues(A), K, growth)
 
 
-def _growth(loop: ca.Function, x: Array, t: float, T: float) -> float:
+def _growth(loop: ca.Function, x: Array, t: float, T: float, size: Array) -> float:
     """||Phi(T, t)||_2 along the closed loop's own run from x at t; inf where it is lost."""
-    n = len(x)
+    n, sizes = len(x), np.r_[size, np.divide.outer(size, size).ravel()]  # of x and Phi
 
     def field(time: float, z: Array) -> Array:
         xdot, A, _ = loop(z[:n], time)
         return np.r_[xdot.full().ravel(), (A.full() @ z[n:].reshape(n, n)).ravel()]
 
-    path = solve_ivp(field, (t, T), np.r_[x, np.eye(n).ravel()], rtol=1e-6, atol=1e-8)
+    path = solve_ivp(field, (t, T), np.r_[x, np.eye(n).ravel()], rtol=1e-6, atol=1e-8 * sizes)
     end = path.y[n:, -1].reshape(n, n)
     return float(np.linalg.norm(end, 2)) if path.success and np.isfinite(end).all() else np.inf
 

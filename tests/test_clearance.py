@@ -46,6 +46,7 @@ def test_no_solver_says_solved_where_the_wall_cannot_be_missed():
     planned = NMPC(ocp, 40, starts=2).solve(x0, workers=1)
     assert planned.success.tolist() == [False, True]
     assert "infeasible" in planned.message[0]
+    assert "where none of them holds 'wall' from there" in planned.message[0]
     assert planned.clearance[1] >= -1e-6
 
 

@@ -1,5 +1,6 @@
 """The simulation error: its sensitivities, its Gauss-Newton step, windows with holes."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 from nocl.sysid.from_log import initial
 from nocl.sysid.labels import box_of
 from nocl.sysid.logs.log import Log
-from nocl.sysid.logs.shooting import WindowFit, WindowProblem, Windows, lengths
+from nocl.sysid.logs.shooting import WindowFit, WindowProblem, Windows, first_noise, lengths
 from nocl.sysid.networks import assemble
 from nocl.sysid.settings import LogSettings
 from nocl.sysid.stated import Stated
@@ -18,7 +19,7 @@ from nocl.systems import pendulum
 SMALL = LogSettings(width=3, window=4)
 
 
-def problem(substeps: int = 1, ridge: float = 0.0, n: int = 12) -> WindowProblem:
+def problem(substeps: int = 1, ridge: float = 0.0, n: int = 12, m: int = 4) -> WindowProblem:
     """A small random network on a short log with a hole and a window that is cut off."""
     system, rng = pendulum.system(), np.random.default_rng(0)
     x = np.column_stack([np.sin(0.3 * np.arange(n)), np.cos(0.3 * np.arange(n))]) + 0.1 * rng.standard_normal((n, 2))
@@ -29,7 +30,7 @@ def problem(substeps: int = 1, ridge: float = 0.0, n: int = 12) -> WindowProblem
     weights[0][2] = torch.from_numpy(0.3 * rng.standard_normal(weights[0][2].shape))
     net = assemble(parts, weights, True)
     unit = torch.from_numpy(rng.uniform(0.5, 2.0, sum(p.numel() for p in net.parameters())))
-    windows = Windows.of(log, [r.smooth.x for r in log], 4, 100, rng)
+    windows = Windows.of(log, [r.smooth.x for r in log], m, 100, rng, first_noise(log))
     return WindowProblem(net, unit, windows, substeps, ridge)
 
 
@@ -78,6 +79,21 @@ def test_windows_hold_every_sample_and_count_holes_out():
     assert w.u.shape == (3, 4, 1)
     assert float(w.there.sum()) == 2 * (12 + 2) - 1  # the windows share two samples, one value is missing
     assert w.h[2].ravel().tolist() == pytest.approx([0.1, 0.1, 0.1, 0.0])
+
+
+def test_the_noise_is_what_the_fit_leaves_but_for_the_starts_freedom():
+    """Of simulations by the very network, with noise: windows of two steps, whose starts take a third of the rows."""
+    p = problem(n=401, m=2)
+    theta, w = theta_of(p), p.windows
+    sigma = torch.tensor([0.02, 0.005], dtype=torch.float64)
+    noise = sigma * torch.randn(w.x.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    p.windows = w = dataclasses.replace(w, x=(w.paths(p.f(theta), w.start, 1) + noise) * w.there)
+    start = w.start
+    for _ in range(3):  # Gauss-Newton steps of the starts alone
+        start = start + p.normal(theta, start)[2]
+    np.testing.assert_allclose(p.noise(theta, start), sigma, rtol=0.15)  # of 400 degrees of freedom: 3.5 %
+    naive = w.residuals(w.paths(p.f(theta), start, 1)).square().mean(dim=(0, 1)).sqrt() * w.noise
+    assert (naive < 0.9 * sigma).all()
 
 
 def test_each_step_lowers_the_error():

@@ -30,6 +30,7 @@ from nocl.system import System
 CARD = "ensemble.json"
 USUAL = 0.99  # share of the samples that were learned from whose disagreement is below `usual`
 FACTOR = 2.0  # times `usual`: more is doubtful
+ROUNDING = 1e-9  # of the largest xdot: members that are the same formula differ by less
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -66,17 +67,23 @@ class Ensemble:
 
     def disagreement(self, x: ArrayLike, u: ArrayLike) -> Array:
         """Root mean square over members of ||f_i - mean||_2 at x [N, nx], u [N, nu], in the units of xdot: [N]."""
+        return self._spread(x, u)[0]
+
+    def _spread(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
+        """(disagreement, ||mean||_2), both [N]."""
         s = self.system
         rows = [torch.tensor(checks.states(v, n, s.name, name)[0])
                 for v, n, name in ((x, s.nx, "x"), (u, s.nu, "u"))]
         with torch.no_grad():
             f = torch.stack([m(*rows) for m in self.members])
-        return (f - f.mean(dim=0)).square().sum(dim=2).mean(dim=0).sqrt().numpy()
+        mean = f.mean(dim=0)
+        return (f - mean).square().sum(dim=2).mean(dim=0).sqrt().numpy(), mean.norm(dim=1).numpy()
 
     def doubtful(self, x: ArrayLike, u: ArrayLike) -> Any:
         """Where not to trust the model: disagreement of more than twice the usual one (not of rounding alone). [N] bool
         """
-        return self.disagreement(x, u) > max(FACTOR * self.usual, 1e-9)
+        apart, size = self._spread(x, u)
+        return apart > max(FACTOR * self.usual, ROUNDING * size.max(initial=0.0))
 
     def doubt(self, x: ArrayLike, u: ArrayLike) -> Array:
         """The share of each trajectory's nodes x [B, K+1, nx], u [B, K or K+1, nu] that is doubtful, for reports: [B].

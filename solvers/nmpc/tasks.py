@@ -137,6 +137,10 @@ def _remedy(outcome: str, program: Transcription) -> str:
     if outcome == GIVEN_UP:
         return "another solver (solver='ipopt'), more starts, another guess, or a longer time_limit"
     soft = ", or constraints='soft'" if program.n_path else ""
+    if outcome == INFEASIBLE and program.n_path:
+        held = " and ".join(map(repr, program.ocp.path_constraints))
+        return (f"another initial state, or wider bounds of the controls, where none of them holds {held} from there; "
+                f"else more starts or another guess{soft}")
     if outcome == NOT_A_NUMBER:
         return "a guess that stays where f, L and h are finite, or bounds lbu, ubu that keep the states there" + soft
     return "more starts, another guess, or more intervals" + soft

@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import pytest
 from processes import python, run, table
 
 VIEW = Path(__file__).parent / "users_view.py"
-pytestmark = pytest.mark.xdist_group("users_view")  # one run of the lines for all tests of this file
 
 AFTER = f"""
 import json, runpy
@@ -51,30 +49,31 @@ print(json.dumps({{
 """
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("users_view")
+def test_the_lines_keep_what_they_promise(tmp_path):
+    """One test, so that the lines run once, whatever processes tests are shared out to."""
+    facts = python(AFTER, tmp_path)
+    shapes_and_names_are_those_that_are_promised(facts)
+    every_form_is_the_same_controller(facts)
+    what_is_learned_is_near_optimal_on_the_exact_dynamics(facts)
+    compare_has_a_row_per_method_and_state(facts, tmp_path)
+    files_are_where_they_were_asked_for(tmp_path)
+    the_c_code_compiles_without_a_warning_and_passes_its_self_tests(tmp_path)
 
 
-@pytest.fixture(scope="module")
-def facts(folder):
-    return python(AFTER, folder)
-
-
-def test_shapes_and_names_are_those_that_are_promised(facts):
+def shapes_and_names_are_those_that_are_promised(facts):
     assert facts["shapes"] == [[8, 1], [8], [8, 2]]
     assert facts["one state"] == [[1], []]
     assert facts["names"] == [["policy", ["x", "t"], ["u"]], ["value", ["x", "t"], ["V"]], ["f", ["x", "u"], ["xdot"]]]
     assert facts["solution"] == [[8], [8, 81, 2], [8, 80, 1], [8, 81, 2]]
 
 
-def test_every_form_is_the_same_controller(facts):
+def every_form_is_the_same_controller(facts):
     assert facts["reloaded"] == 0
     assert max(facts[name] for name in ("policy", "V_fun", "f_theta", "f_torch")) < 1e-11
     assert facts["policy_l4c"] < 1e-4  # in float32, of controls up to 5
 
 
-def test_what_is_learned_is_near_optimal_on_the_exact_dynamics(facts):
+def what_is_learned_is_near_optimal_on_the_exact_dynamics(facts):
     assert facts["solved"]
     assert facts["f"] < 1e-3
     assert facts["V"] < 0.02
@@ -83,7 +82,7 @@ def test_what_is_learned_is_near_optimal_on_the_exact_dynamics(facts):
     assert p95 < 5
 
 
-def test_compare_has_a_row_per_method_and_state(facts, folder):
+def compare_has_a_row_per_method_and_state(facts, folder):
     assert [row["method"] for row in facts["summary"]] == ["CND", "NMPC"]
     assert facts["rows"] == 200
     rows = table(folder / "runs/pendulum/report/rows.csv")
@@ -94,12 +93,12 @@ def test_compare_has_a_row_per_method_and_state(facts, folder):
     assert [[a[c] for c in starts] for a in rows[:100]] == [[b[c] for c in starts] for b in rows[100:]]
 
 
-def test_files_are_where_they_were_asked_for(facts, folder):
+def files_are_where_they_were_asked_for(folder):
     assert {p.name for p in folder.iterdir()} == {"runs", "build"}
     assert (folder / "runs/pendulum/report/report.html").stat().st_size > 10_000
 
 
-def test_the_c_code_compiles_without_a_warning_and_passes_its_self_tests(facts, folder):
+def the_c_code_compiles_without_a_warning_and_passes_its_self_tests(folder):
     said = run(["make", "check"], folder / "build/pendulum").splitlines()
     passed = {line.split(":")[0] for line in said if line.endswith(": ok")}
     assert passed == {f"pendulum_{name}" for name in ("policy", "gain", "value", "value_gradient")}

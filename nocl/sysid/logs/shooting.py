@@ -51,7 +51,7 @@ class Windows:
     noise: Tensor  # [nx], what residuals are measured in
 
     @staticmethod
-    def of(log: Log, states: Sequence[Array], m: int, most: int, rng: np.random.Generator) -> Windows:
+    def of(log: Log, states: Sequence[Array], m: int, most: int, rng: np.random.Generator, sigma: Array) -> Windows:
         """All windows of m steps of a log, or `most` of them at random; starts are from each run's states [K+1, nx]."""
         at = [(i, k) for i, run in enumerate(log) for k in range(0, len(run) - 1, m)]
         if len(at) > most:
@@ -59,7 +59,6 @@ class Windows:
         pieces = [_window(log.runs[i], k, m) for i, k in at]
         x, u, h = (np.stack(p) for p in zip(*pieces, strict=True))
         start, there = np.stack([states[i][k] for i, k in at]), np.isfinite(x)
-        sigma = np.hypot(noise(log), NOISE_FLOOR * spread_of(np.concatenate([r.smooth.x for r in log])))
         arrays = (start, np.where(there, x, 0.0), there.astype(float), u, h[..., None], sigma)
         tensors = [torch.from_numpy(np.ascontiguousarray(a)) for a in arrays]
         return Windows(tuple(at), *tensors)
@@ -88,6 +87,15 @@ def spread_of(values: Array) -> Array:
     """Standard deviations [n], 1 where nothing varies."""
     spread = values.std(axis=0)
     return np.where(spread > 1e-12 * np.abs(values).max(axis=0), spread, 1.0)
+
+
+def first_noise(log: Log) -> Array:
+    """What smoothing took away of each state, and at least NOISE_FLOOR [nx]."""
+    return np.hypot(noise(log), _floor(log))
+
+
+def _floor(log: Log) -> Array:
+    return NOISE_FLOOR * spread_of(np.concatenate([r.smooth.x for r in log]))
 
 
 def _window(run: Recording, k: int, m: int) -> tuple[Array, Array, Array]:
@@ -205,6 +213,13 @@ class WindowProblem:
                 break
         return theta, start, WindowFit(self.windows.u.shape[1], seen[0]**0.5, seen[-1]**0.5, len(seen) - 1)
 
+    def noise(self, theta: Tensor, start: Tensor) -> Array:
+        """What the fit leaves of each state, with the degrees of freedom that starts took [nx]."""
+        with torch.no_grad():
+            r = self.windows.residuals(self.windows.paths(self.f(theta), start, self.substeps)) * self.windows.noise
+        free = self.windows.there.sum(dim=(0, 1)) - self.windows.there.amax(dim=1).sum(dim=0)
+        return (r.square().sum(dim=(0, 1)) / free.clamp(min=1)).sqrt().numpy()
+
     def put(self, states: Sequence[Array], theta: Tensor, start: Tensor) -> None:
         """Write the simulated states of the windows into each run's [K+1, nx]."""
         with torch.no_grad():
@@ -243,18 +258,22 @@ def fit_simulation(net: FeatureNet, unit: Array, log: Log, *, window: int, windo
     """Gauss-Newton steps on windows that grow as long as they succeed; changes the network.
 
     A short window has a minimum that can be reached from afar, even where the plant is unstable or smoothing was poor;
-    its minimum, weights and states, is where the next one starts. `report`: root mean square residual of each step.
+    its minimum, weights and states, is where the next one starts. So is the noise that it leaves, where that is less
+    than smoothing took away: where controls jump, smoothing takes away what is no noise. `report`: root mean square
+    residual of each step.
     """
     scale, states = torch.from_numpy(unit), [run.smooth.x.copy() for run in log]
     theta = torch.nn.utils.parameters_to_vector(net.parameters()).detach() / scale
     stages: list[WindowFit] = []
+    sigma, floor = first_noise(log), _floor(log)
     for m in (all_lengths := lengths(window, log)):
         most = windows * window // m  # as many samples
-        problem = WindowProblem(net, scale, Windows.of(log, states, m, most, rng), substeps, ridge)
+        problem = WindowProblem(net, scale, Windows.of(log, states, m, most, rng, sigma), substeps, ridge)
         theta, start, stage = problem.minimise(theta, steps, LAST if m == all_lengths[-1] else ENOUGH, report)
         stages.append(stage)
         if stage.failed:
             break
         problem.put(states, theta, start)
+        sigma = np.minimum(sigma, np.hypot(problem.noise(theta, start), floor))
     torch.nn.utils.vector_to_parameters(theta * scale, net.parameters())
     return stages
