@@ -62,9 +62,11 @@ def test_it_is_riccatis_at_every_mass_and_goal(trained):
     x, t, p = states(trained)
     u, V, V_x, V_p = exact(x, t, p)
     assert share(trained(x, t, p) - u, u) < 0.04
-    assert share(trained.value(x, t, p) - V, V) < 0.04
-    assert share(trained.value_gradient(x, t, p) - V_x, V_x) < 0.08
-    assert share(trained.value_gradient_by_p(x, t, p)[:, 1] - V_p[:, 1], V_p[:, 1]) < 0.08
+    assert share(trained.value(x, t, p) - V, V) < 0.02
+    assert share(trained.value_gradient(x, t, p) - V_x, V_x) < 0.04
+    by_p = trained.value_gradient_by_p(x, t, p)
+    assert share(by_p[:, 0] - V_p[:, 0], V_p[:, 0]) < 0.12
+    assert share(by_p[:, 1] - V_p[:, 1], V_p[:, 1]) < 0.04
     assert trained.card["gap_median"] < 3e-3
 
 
