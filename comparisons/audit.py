@@ -14,6 +14,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from nocl.comparisons.at_each import Laws
+from nocl.comparisons.methods import Starts
 from nocl.comparisons.report.findings import MethodAudit, Rollouts, ValueAudit, per_cent
 from nocl.comparisons.report.report import Report
 from nocl.comparisons.report.results import (
@@ -51,9 +53,9 @@ def audit(report: Report, methods: Mapping[str, Any], model: Any = None) -> tupl
 def _audit(report: Report, judged: Judged, method: Any, learned: ca.Function | None,
            doubt: Callable[[Array, Array], Array] | None) -> MethodAudit:
     plants = {EXACT: report.ocp.functions.f} | ({} if learned is None else {LEARNED: learned})
-    control = _control(report.ocp, judged, method)
+    control, starts = _control(report, judged, method), Starts(report.x0, report.parameters)
     rollouts = () if control is None else tuple(
-        _rollout(report.ocp, name, f, judged.simulation.t, report.x0, *control) for name, f in plants.items())
+        _rollout(report.ocp, name, f, judged.simulation.t, starts, *control) for name, f in plants.items())
     cost = {r.name: r.cost for r in rollouts}
     return MethodAudit(judged.name, rollouts, _excess(judged, cost.get(LEARNED)), _excess(judged, cost.get(EXACT)),
                        _value(report, judged, method),
@@ -70,22 +72,25 @@ def _excess(judged: Judged, cost: Array | None) -> Array:
     return np.where(np.isfinite(J), excess, np.where(np.isfinite(cost), np.inf, np.nan))
 
 
-def _control(ocp: OCP, judged: Judged, method: Any) -> tuple[Ask, bool] | None:
+def _control(report: Report, judged: Judged, method: Any) -> tuple[Ask, bool] | None:
     """(the control, whether it is held from node to node); None for NMPC's loop: it would have to be solved anew."""
     if isinstance(method, Loop):
         return None
-    t, u = judged.simulation.t, judged.simulation.u
+    ocp, t, u = report.ocp, judged.simulation.t, judged.simulation.u
+    starts = Starts(report.x0, report.parameters)
     if judged.plan is not None:
         return (lambda x, time, rows: u[rows, int(np.searchsorted(t, time + 1e-9 * t[-1], side="right")) - 1]), True
     policy = policy_function(ocp, method)
     if policy is None or (not isinstance(method, ca.Function) and callable(method)):  # rows at once are faster
-        return (lambda x, time, rows: np.asarray(method(x, time), dtype=np.float64)), policy is None
-    return (lambda x, time, rows: policy(x.T, time).full().T), False
+        held = policy is None and not (isinstance(method, Laws) and method.continuous)
+        return (lambda x, time, rows: np.asarray(method(x, time, *starts[rows].given(ocp, method)), float)), held
+    at = ocp.functions.feedback()
+    return (lambda x, time, rows: policy(*at.columns(x=x, t=np.full(len(x), time), p=starts.p[rows])).full().T), False
 
 
-def _rollout(ocp: OCP, name: str, f: ca.Function, t: Array, x0: Array, ask: Ask, held: bool) -> Rollouts:
+def _rollout(ocp: OCP, name: str, f: ca.Function, t: Array, starts: Starts, ask: Ask, held: bool) -> Rollouts:
     """RK4 from node to node with the cost as an extra state, feedback at each stage unless held."""
-    s, K = ocp.system, len(t) - 1
+    s, K, x0, of = ocp.system, len(t) - 1, starts.x, ocp.functions.on(f)
     z, first = np.c_[x0, np.zeros((len(x0), 2))], np.zeros((0, 0))  # z = (x, cost, t)
     x, u = np.full((len(x0), K + 1, s.nx), np.nan), np.full((len(x0), K, s.nu), np.nan)
 
@@ -99,7 +104,8 @@ def _rollout(ocp: OCP, name: str, f: ca.Function, t: Array, x0: Array, ask: Ask,
 
     def field(z: Array, _: None) -> Array:
         v = first if held else answer(z[:, : s.nx], float(z[0, -1]))
-        return np.c_[f(z[:, : s.nx].T, v.T).full().T, ocp.L(z[:, : s.nx].T, v.T).full().T, np.ones(len(z))]
+        given = of.arguments.columns(x=z[:, : s.nx], u=v, t=z[:, -1], p=starts.p)
+        return np.c_[of.f(*given).full().T, of.L(*given).full().T, np.ones(len(z))]
 
     steps = 1 if held else SUBSTEPS
     for k in range(K):
@@ -109,7 +115,7 @@ def _rollout(ocp: OCP, name: str, f: ca.Function, t: Array, x0: Array, ask: Ask,
             z = rk4(field, z, None, (t[k + 1] - t[k]) / steps)
             z[:, -1] = t[k] + i * (t[k + 1] - t[k]) / steps
     x[:, -1] = z[:, : s.nx]
-    cost = z[:, s.nx] + ocp.G(x[:, -1].T).full().ravel()
+    cost = z[:, s.nx] + of.G(*of.end.columns(x=x[:, -1], p=starts.p)).full().ravel()
     return Rollouts(name, t, x, u, np.where(np.isfinite(cost), cost, np.inf))
 
 
@@ -120,28 +126,32 @@ def _value(report: Report, judged: Judged, method: Any) -> ValueAudit | None:
         V = None
     if V is None:
         return None
-    ocp, s, B = report.ocp, judged.simulation, len(report.x0)
-    derivatives = _derivatives(V)
+    ocp, s, (B, K), of = report.ocp, judged.simulation, judged.simulation.x.shape[:2], report.ocp.functions
+    derivatives = _derivatives(V, report.parameters)
     _, V_x, V_t = derivatives(s.x, s.t)
-    x, u = s.x.reshape(-1, ocp.system.nx).T, s.u.reshape(-1, ocp.system.nu).T
-    flow = np.einsum("bki,bki->bk", V_x, ocp.functions.f(x, u).full().T.reshape(V_x.shape))
-    hjb = V_t + ocp.L(x, u).full().reshape(B, -1) + flow
-    slope = _hamiltonian_gradient(ocp)(x, u, V_x.reshape(-1, ocp.system.nx).T).full().T
+    x, u, slopes = (rows.reshape(B * K, -1) for rows in (s.x, s.u, V_x))
+    at = {"x": x, "u": u, "t": np.tile(s.t, B), "p": np.repeat(report.parameters, K, axis=0)}
+    given = of.arguments.columns(**at)
+    flow = np.einsum("bki,bki->bk", V_x, of.f(*given).full().T.reshape(V_x.shape))
+    hjb = V_t + of.L(*given).full().reshape(B, -1) + flow
+    slope = _hamiltonian_gradient(ocp)(*of.stage.columns(**at), slopes.T).full().T
     start = derivatives(report.x0[:, None], s.t[:1])[0][:, 0]
     return ValueAudit(start, np.abs(start - s.cost), *_against_costate(report, derivatives), s.t, hjb,
-                      np.linalg.norm(_free(ocp, u.T, slope), axis=1).reshape(B, -1))
+                      np.linalg.norm(_free(ocp, u, slope), axis=1).reshape(B, -1))
 
 
-def _derivatives(V: ca.Function) -> Callable[[Array, Array], tuple[Array, Array, Array]]:
-    """(x [B, n, nx], t [n]) -> V [B, n], V_x [B, n, nx], V_t [B, n]."""
+def _derivatives(V: ca.Function, p: Array) -> Callable[[Array, Array], tuple[Array, Array, Array]]:
+    """(x [B, n, nx], t [n]) -> V [B, n], V_x [B, n, nx], V_t [B, n], at parameters p [B, np]."""
     at = Arguments.of(V)
-    value, (x, t) = at.call(V), at.inputs
+    value, (x, t) = at.call(V), at.inputs[:2]
     gradient = at.function("gradient", {"V": value, "V_x": ca.densify(ca.jacobian(value, x)).T,
                                         "V_t": ca.densify(ca.jacobian(value, t))})
+    takes_p = V.n_in() > 2
 
     def derivatives(x: Array, t: Array) -> tuple[Array, Array, Array]:
         B, n, nx = x.shape
-        value, V_x, V_t = (g.full() for g in gradient(x.reshape(-1, nx).T, np.tile(t, B)[None]))
+        more = [np.repeat(p, n, axis=0).T] if takes_p else []
+        value, V_x, V_t = (g.full() for g in gradient(x.reshape(-1, nx).T, np.tile(t, B)[None], *more))
         return value.reshape(B, n), V_x.T.reshape(B, n, nx), V_t.reshape(B, n)
 
     return derivatives

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from nocl.comparisons.at_each import Laws
 from nocl.comparisons.judging import Disturbance, Judgement, Judging, judge
-from nocl.comparisons.methods import MethodRun, Solving, checked, is_count, rates_of, runs_of
+from nocl.comparisons.methods import MethodRun, Solving, Starts, checked, is_count, rates_of, runs_of
 from nocl.comparisons.report.report import Report
 from nocl.comparisons.report.results import (
     Judged,
@@ -30,11 +31,15 @@ from nocl.support.pool import Pool
 
 def compare(ocp: OCP, methods: Mapping[str, Any], n: int = 100, x0: ArrayLike | None = None, seed: int = 1,
             hold: int | Sequence[int | None] | None = None, workers: int | str = 1,
-            out: str | os.PathLike[str] | None = None, progress: bool | None = None) -> Report:
+            out: str | os.PathLike[str] | None = None, progress: bool | None = None, p: Any = None) -> Report:
     """Judge `methods` (by name) on the same initial states: x0 [nx] or [B, nx], else n drawn with `seed`.
+
+    On a problem with parameters each state has its own p, drawn with `seed` too. Methods that know no p are made anew
+    at each by nocl.comparisons.at_each.
 
     Parameters
     ----------
+    p : parameters, [np] for all states, [B, np], or by name (OCP.parameters_of); drawn where states are
     hold : rates of feedback: None, continuous; K, continuous and once more held on K intervals, as the method
         "NAME (K holds)"; a list of these, [None, 80, 400], each
     workers : 1, a number of processes, or "auto": processes where the measured cost of the first parts says that they
@@ -50,54 +55,62 @@ def compare(ocp: OCP, methods: Mapping[str, Any], n: int = 100, x0: ArrayLike | 
     Raises ValueError for methods that are none, or are made for another problem.
     """
     checks.problem(ocp, "compare")
-    ocp.refuse_parameters("compare")
     checks.whole(seed, "seed", "compare", most=2**63)
     Pool(workers)  # refuses what is none before anything is solved
-    states = initial_states(ocp, n, x0, seed)
+    states = starts_of(ocp, n, x0, seed, p)
     rates, folder = rates_of(hold), None if out is None else Path(out)
     start = time.perf_counter()
     runs = runs_of(ocp, checked(methods), states, rates, Solving(workers, folder, progress))
     job = Judging(ocp, states, runs, Disturbance(), [0.0] * len(runs))
     judgements = judge(job, workers, None if folder is None else folder / "judged", progress, "judging")
-    judged = tuple(_judged(run, judgement, states) for run, judgement in zip(runs, judgements, strict=True))
-    settings = {"seed": seed if x0 is None else None, "n": len(states),
+    judged = tuple(_judged(ocp, run, judgement, states) for run, judgement in zip(runs, judgements, strict=True))
+    drawn = f"drawn with seed {seed}"
+    settings = {"seed": seed if x0 is None and p is None else None, "n": len(states),
                 "hold": ", ".join("continuous" if rate is None else str(rate) for rate in rates),
-                "initial states": "given" if x0 is not None else f"drawn with seed {seed}"}
-    return Report(ocp, states, judged, settings, time.perf_counter() - start)
+                "initial states": "given" if x0 is not None else drawn}
+    if ocp.np:
+        settings["parameters"] = "given" if p is not None else drawn
+    return Report(ocp, states.x, judged, settings, time.perf_counter() - start, states.p)
 
 
-def initial_states(ocp: OCP, n: int, x0: ArrayLike | None, seed: int) -> Array:
-    """The states [B, nx] that are meant."""
+def starts_of(ocp: OCP, n: int, x0: ArrayLike | None, seed: int, p: Any) -> Starts:
+    """The states and parameters that are meant."""
     if x0 is None:
         if not is_count(n):
             raise ValueError(f"n is {checks.shown(n)}; expected a number of initial states >= 1")
-        return ocp.initial_states.sample(int(n), seed)
+        drawn = Starts.drawn(ocp, int(n), seed)
+        return drawn if p is None else Starts(drawn.x, ocp.parameters_of(p, len(drawn), "compare"))
     rows = checks.states(x0, ocp.system.nx, ocp.system.name)[0].copy()
     if not len(rows):
         raise ValueError("x0 has no rows; expected at least one initial state")
-    return rows
+    return Starts(rows, ocp.parameters_of(p, len(rows), "compare"))
 
 
-def _judged(run: MethodRun, judgement: Judgement, x0: Array) -> Judged:
+def _judged(ocp: OCP, run: MethodRun, judgement: Judgement, starts: Starts) -> Judged:
     s, solved = judgement.simulation, run.solved
-    solves = np.ones(len(x0)) if solved is None else solved.solves
-    predicted = _predicted(run.method, x0) if solved is None else solved.predicted
+    solves = np.ones(len(starts)) if solved is None else solved.solves
+    predicted = _predicted(ocp, run.method, starts) if solved is None else solved.predicted
     return Judged(run.name, run.how, s, judgement.ms_first, judgement.ms_per_control, judgement.evaluations, solves,
-                  predicted, None if solved is None else solved.plan, _value(run.method, predicted), run.held)
+                  predicted, None if solved is None else solved.plan, _value(ocp, run.method, predicted), run.held)
 
 
-def _value(method: Any, predicted: Array) -> Any:
+def _value(ocp: OCP, method: Any, predicted: Array) -> Any:
     """The method's own value function, which the report draws slices of, where it answers."""
-    return method.value if hasattr(method, "value") and np.isfinite(predicted).any() else None
+    if not (hasattr(method, "value") and np.isfinite(predicted).any()):
+        return None
+    return lambda x, t, p: method.value(x, t, *Starts(x, p).given(ocp, method))
 
 
-def _predicted(method: Any, x0: Array) -> Array:
-    """The cost that the method itself expects, V(x0, 0), where it has a value function; else NaN."""
+def _predicted(ocp: OCP, method: Any, starts: Starts) -> Array:
+    """The cost that the method itself expects, V(x0, 0[, p]), where it has a value function; else NaN."""
+    if isinstance(method, Laws):
+        alone = [Starts(starts.x[[i]], np.zeros((1, 0))) for i in range(len(starts))]
+        return np.concatenate([_predicted(ocp, method.at(p), one) for one, p in zip(alone, starts.p, strict=True)])
     if hasattr(method, "value"):
         try:
-            values = np.asarray(method.value(x0, 0.0), dtype=np.float64).ravel()
+            values = np.asarray(method.value(starts.x, 0.0, *starts.given(ocp, method)), dtype=np.float64).ravel()
         except Exception:  # a prediction that cannot be had is no failure of the controller
             values = np.empty(0)
-        if len(values) == len(x0):
+        if len(values) == len(starts):
             return values
-    return np.full(len(x0), np.nan)
+    return np.full(len(starts), np.nan)

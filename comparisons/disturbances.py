@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nocl.comparisons.judging import Disturbance, Judgement, Judging, judge, key_of
-from nocl.comparisons.methods import MethodRun, Solving, at_rate, checked, folder_name, how, runs_of
+from nocl.comparisons.methods import MethodRun, Solving, Starts, at_rate, checked, folder_name, how, runs_of
 from nocl.comparisons.reference import SLOTS, Reference, resolved
 from nocl.comparisons.report.findings import Robustness, Scenario, ScenarioLoss
 from nocl.comparisons.report.results import VIOLATION
@@ -70,6 +70,7 @@ def robustness(ocp: OCP, methods: Mapping[str, Any], x0: ArrayLike, variants: Ma
     variants : plants by name that the methods do not know, {"mass +20 %": system}: a System, an OCP (its system
         counts), a casadi.Function (x, u) -> xdot, or an object with `to_casadi()`
     """
+    ocp.refuse_parameters("robustness")
     rows, _ = checks.states(x0, ocp.system.nx, ocp.system.name)
     return _Study(ocp, checked(methods), rows.copy(), settings or Disturbances(), workers,
                   None if out is None else Path(out), progress).run(variants or {})
@@ -104,7 +105,8 @@ class _Study:
                  out: Path | None, progress: bool | None) -> None:
         self.ocp, self.x0, self.settings, self.workers, self.out = ocp, x0, settings, workers, out
         self.progress = progress
-        self.runs = runs_of(ocp, methods, x0, (None,), Solving(workers, out, progress))
+        self.starts = Starts(x0, np.zeros((len(x0), 0)))
+        self.runs = runs_of(ocp, methods, self.starts, (None,), Solving(workers, out, progress))
         rate = settings.hold
         self.held = [run if run.solved is not None else replace(
             run, hold=rate, how=how(rate), controller=at_rate(run.controller, rate)) for run in self.runs]
@@ -180,7 +182,7 @@ class _Study:
                **disturbance: Any) -> list[Judgement]:
         late = [0.0 if run.solved is not None else d for run, d in
                 zip(runs, delays or [0.0] * len(runs), strict=True)]
-        job = Judging(self.ocp, self.x0, list(runs), Disturbance(seed=self.settings.seed, **disturbance), late,
+        job = Judging(self.ocp, self.starts, list(runs), Disturbance(seed=self.settings.seed, **disturbance), late,
                       timed=name == "undisturbed")
         folder = None if self.out is None else self.out / f"{folder_name(name)}-{key_of(job)[:12]}"
         return judge(job, self.workers, folder, self.progress, name)

@@ -15,8 +15,9 @@ import cloudpickle
 import numpy as np
 from numpy.typing import NDArray
 
-from nocl.comparisons.methods import STAGES, MethodRun, said, substeps_of
-from nocl.judge import Simulation, simulate
+from nocl.comparisons.at_each import Laws
+from nocl.comparisons.methods import STAGES, MethodRun, Starts, said, substeps_of
+from nocl.judge import Simulation, policy_function, simulate
 from nocl.ocp import OCP
 from nocl.solvers.nmpc.loop import Loop
 from nocl.support.checks import Array
@@ -88,7 +89,7 @@ class Judging:
     """Judges shares; `delays` [runs] is the time from a sample to its control."""
 
     ocp: OCP
-    x0: Array
+    starts: Starts
     runs: Sequence[MethodRun]
     disturbance: Disturbance
     delays: Sequence[float]
@@ -105,11 +106,14 @@ class Judging:
         """By cloudpickle, so that users' functions reach processes too."""
         slim = [replace(run, method=None, solved=None if run.solved is None else
                         replace(run.solved, plan=None)) for run in self.runs]  # type: ignore[arg-type]
-        return _unpickled, (cloudpickle.dumps((self.ocp, self.x0, slim, self.disturbance, self.delays, self.timed)),)
+        parts = (self.ocp, self.starts, slim, self.disturbance, self.delays, self.timed)
+        return _unpickled, (cloudpickle.dumps(parts),)
 
     def judge(self, run: MethodRun, rows: Rows, delay: float) -> Judgement:
         if run.solved is not None:
             return self._plan(run, rows)
+        if isinstance(run.controller, Laws):
+            return joined(self.ocp, [self._at(run, run.controller, row, delay) for row in rows])
         try:
             return self._feedback(run, rows, delay)
         except Exception as error:  # whatever a user's controller raises becomes a row: the other states go on
@@ -117,20 +121,32 @@ class Judging:
                 return joined(self.ocp, [self.judge(run, row[None], delay) for row in rows])
             return _unknown(failed(self.ocp, [said(error)], self._nodes(run.hold or 80)))
 
+    def _at(self, run: MethodRun, laws: Laws, row: int, delay: float) -> Judgement:
+        """One state of a law that is made for its p, judged on the problem at that p."""
+        p = self.starts.p[row]
+        ocp, alone = self.ocp.folded(p), Starts(self.starts.x[[row]], np.zeros((1, 0)))
+        try:
+            law = laws.at(p)
+        except Exception as error:  # whatever it raises at this p
+            return _unknown(failed(self.ocp, [said(error)], self._nodes(run.hold or 80)))
+        controller = policy_function(ocp, law) or law
+        job = replace(self, ocp=ocp, starts=alone)
+        return job.judge(replace(run, controller=controller), np.zeros(1, dtype=np.int64), delay)
+
     def _nodes(self, K: int) -> Array:
         return np.linspace(0.0, self.ocp.horizon, K + 1)
 
     def _feedback(self, run: MethodRun, rows: Rows, delay: float) -> Judgement:
-        x0, controller, d = self.x0[rows], run.controller, self.disturbance
+        starts, controller, d = self.starts[rows], run.controller, self.disturbance
         if d.noise is not None and run.hold is not None:
             controller = _Noisy(controller, self.ocp.horizon, run.hold, _noise(d, rows, run.hold))
-        s = simulate(self.ocp, controller, x0, f=d.f, hold=run.hold, delay=delay,
-                     kicks=[(t, dx[rows]) for t, dx in d.kicks])
+        s = simulate(self.ocp, controller, starts.x, f=d.f, hold=run.hold, delay=delay,
+                     kicks=[(t, dx[rows]) for t, dx in d.kicks], p=starts.p)
         if isinstance(run.controller, Loop):
             return Judgement(s, *_of_loop(run.controller))
         if not self.timed:
             return _unknown(s)
-        first, median = np.array([_milliseconds(run.controller, x) for x in x0]).T
+        first, median = np.array([_milliseconds(self.ocp, run.controller, starts[[i]]) for i in range(len(rows))]).T
         free = isinstance(run.controller, ca.Function)
         return Judgement(s, first, median, np.full(len(rows), 0.0 if free else np.nan))
 
@@ -142,8 +158,12 @@ class Judging:
         s, d = failed(self.ocp, message, self._nodes(run.controller.shape[1])), self.disturbance
         if ok.any():
             kicks = [(t, dx[rows[ok]]) for t, dx in d.kicks]
-            s = _put(s, simulate(self.ocp, run.controller[rows[ok]], self.x0[rows[ok]], f=d.f, kicks=kicks), ok)
+            s = _put(s, self._open_loop(run, rows[ok], kicks), ok)
         return Judgement(s, run.solved.ms[rows], np.full(len(rows), np.nan), run.solved.evaluations[rows])
+
+    def _open_loop(self, run: MethodRun, rows: Rows, kicks: Sequence[tuple[float, Array]]) -> Simulation:
+        starts = self.starts[rows]
+        return simulate(self.ocp, run.controller[rows], starts.x, f=self.disturbance.f, kicks=kicks, p=starts.p)
 
 
 def _unpickled(data: bytes) -> Judging:
@@ -152,7 +172,7 @@ def _unpickled(data: bytes) -> Judging:
 
 def judge(job: Judging, workers: int | str, out: Path | None, progress: bool | None, what: str) -> list[Judgement]:
     """All runs of a job on all its states; with `out` what is there already is taken from there."""
-    B = len(job.x0)
+    B = len(job.starts)
     rows = np.array_split(np.arange(B), min(B, PARTS))
     parts = [Share(f"run-{m}-{i:02d}", m, part) for i, part in enumerate(rows) for m in range(len(job.runs))]
     journal = Journal(out, key_of(job) if out is not None else "", "a comparison")
@@ -179,7 +199,8 @@ def key_of(job: Judging) -> str:
     """A fingerprint of all that outcomes depend on; plain callables are known by name."""
     d = job.disturbance
     arrays = [part for run in job.runs for part in run.identity] + [a for kick in d.kicks for a in kick]
-    return fingerprint(job.ocp.to_data(), job.x0, *arrays, list(job.delays), d.seed,
+    starts = [job.starts.x, *([job.starts.p] if job.ocp.np else [])]
+    return fingerprint(job.ocp.to_data(), *starts, *arrays, list(job.delays), d.seed,
                        "" if d.f is None else d.f, "" if d.noise is None else d.noise, version("nocl"),
                        version("casadi"))
 
@@ -212,14 +233,15 @@ def _of_loop(loop: Loop) -> tuple[Array, Array, Array]:
     return ms[0], np.median(ms[1:] if len(ms) > 1 else ms, axis=0), evaluations
 
 
-def _milliseconds(controller: Any, x: Array) -> tuple[float, float]:
+def _milliseconds(ocp: OCP, controller: Any, start: Starts) -> tuple[float, float]:
     """(first, median) time of a control evaluation at (x, 0): the first differs where a controller warm-starts."""
-    argument = x if isinstance(controller, ca.Function) else x[None]
+    x, p = start.x, start.given(ocp, controller)
+    given = [x[0], 0.0, *(row[0] for row in p)] if isinstance(controller, ca.Function) else [x, 0.0, *p]
     times: list[float] = []
     try:
         while len(times) < CALLS and sum(times) < TIMED:
             start = time.perf_counter()
-            controller(argument, 0.0)
+            controller(*given)
             times.append(1e3 * (time.perf_counter() - start))
     except Exception:  # whatever a user's controller raises: the judge has its message
         return np.nan, np.nan

@@ -5,12 +5,15 @@
 - a solver (an object with `solve(x0)`, as NMPC and DDP) or its Solution: open loop, its controls held on its own grid;
 - NMPC's closed loop, and any other callable (x [B, nx], t) -> u [B, nu]: sampled and held, at the rates asked for, else
   at its own, else SAMPLED.
+
+On a problem with parameters feedback is a function of (x, t, p), and solvers have solve(x0, p=); what was made for a
+problem without, as LQR(ocp.at(p)), is run as it is. What knows no p is made at each by `at_each`.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,10 +21,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from nocl.comparisons.at_each import Laws, is_plan
 from nocl.comparisons.report.results import Planned, count
 from nocl.data import Solution
-from nocl.judge import check_made_for, policy_function
+from nocl.judge import check_made_for, check_takes_p, policy_function, takes_p
 from nocl.ocp import OCP
+from nocl.sampling import own_numbers
 from nocl.scales import usual_sizes
 from nocl.solvers.nmpc.loop import Loop
 from nocl.support.checks import LARGEST, Array, shown
@@ -108,7 +113,30 @@ def is_count(value: Any) -> bool:
     return isinstance(value, (int, np.integer)) and not isinstance(value, bool) and 1 <= int(value) <= LARGEST
 
 
-def runs_of(ocp: OCP, methods: Mapping[str, Any], x0: Array, rates: Rates, solving: Solving) -> list[MethodRun]:
+@dataclass(frozen=True, eq=False)
+class Starts:
+    """Where runs begin, and the parameters of each."""
+
+    x: Array  # [B, nx]
+    p: Array  # [B, np]
+
+    def __len__(self) -> int:
+        return len(self.x)
+
+    def __getitem__(self, rows: Any) -> Starts:
+        return Starts(self.x[rows], self.p[rows])
+
+    @staticmethod
+    def drawn(ocp: OCP, n: int, seed: int) -> Starts:
+        """n of the problem's own; the states are the same whether there are parameters or not."""
+        return Starts(ocp.initial_states.sample(n, seed), ocp.sample_parameters(n, own_numbers(seed, 0, 1)))
+
+    def given(self, ocp: OCP, method: Any) -> list[Array]:
+        """The parameters as a further argument of a method, [p] or []."""
+        return [self.p] if takes_p(ocp, method) else []
+
+
+def runs_of(ocp: OCP, methods: Mapping[str, Any], x0: Starts, rates: Rates, solving: Solving) -> list[MethodRun]:
     """The runs of all methods, in order; ValueError for what is no method, before anything is solved."""
     for name, method in methods.items():
         _check(ocp, name, method, x0)
@@ -118,25 +146,27 @@ def runs_of(ocp: OCP, methods: Mapping[str, Any], x0: Array, rates: Rates, solvi
     return [run for name, method in methods.items() for run in _runs(ocp, name, method, x0, rates, solving)]
 
 
-def _check(ocp: OCP, name: str, method: Any, x0: Array) -> None:
+def _check(ocp: OCP, name: str, method: Any, x0: Starts) -> None:
     check_made_for(ocp, method, f"method {name!r}")
     if isinstance(method, Solution):
-        _check_solution(ocp, name, method, x0)
-    elif _policy(ocp, name, method) is None and not hasattr(method, "solve") and not callable(method):
+        return _check_solution(ocp, name, method, x0)
+    if _policy(ocp, name, method) is not None:
+        return
+    if not hasattr(method, "solve") and not callable(method):
         raise ValueError(f"method {name!r} is a {type(method).__name__}; expected a controller with to_casadi(), a "
                          "casadi.Function (x, t) -> u, a solver with solve(x0), a Solution, or a callable (x, t) -> u")
-
-
-def is_plan(method: Any) -> bool:
-    """Whether it is run open loop."""
-    return isinstance(method, Solution) or \
-        (hasattr(method, "solve") and not hasattr(method, "to_casadi") and not isinstance(method, ca.Function))
+    if not is_plan(method):
+        return _named(name, check_takes_p, ocp, method)
+    if takes_p(ocp, method) and "p" not in inspect.signature(method.solve).parameters:
+        raise ValueError(f"method {name!r} is a {type(method).__name__}, whose solve takes no p, and the problem has "
+                         f"the parameters {', '.join(ocp.parameter_names)}; expected solve(x0, p=): let it be made "
+                         "anew at each p, nocl.comparisons.at_each(ocp, make)")
 
 
 def _names(ocp: OCP, name: str, method: Any, rates: Rates) -> list[str]:
     if is_plan(method):
         return [name]
-    if _policy(ocp, name, method) is not None:
+    if _policy(ocp, name, method) is not None or _continuous(method):
         return [_held_name(name, rate) for rate in rates]
     held = _sampled(method, rates)
     return [name] if len(held) == 1 else [_held_name(name, rate) for rate in held]
@@ -146,16 +176,17 @@ def _held_name(name: str, rate: int | None) -> str:
     return name if rate is None else f"{name} ({count(rate, 'hold')})"
 
 
-def _runs(ocp: OCP, name: str, method: Any, x0: Array, rates: Rates, solving: Solving) -> list[MethodRun]:
+def _runs(ocp: OCP, name: str, method: Any, x0: Starts, rates: Rates, solving: Solving) -> list[MethodRun]:
     names = _names(ocp, name, method, rates)
     if is_plan(method):
-        parts = [method] if isinstance(method, Solution) else solve(method, name, x0, solving)
+        parts = [method] if isinstance(method, Solution) else solve(ocp, method, name, x0, solving)
         return [planned(ocp, name, method, parts, len(x0))]
     policy = _policy(ocp, name, method)
     if policy is not None:
         return [MethodRun(n, how(rate), method, policy, rate) for n, rate in zip(names, rates, strict=True)]
-    return [MethodRun(n, how(rate), method, at_rate(method, rate), rate)
-            for n, rate in zip(names, _sampled(method, rates), strict=True)]
+    each = ", made anew at each p" if isinstance(method, Laws) else ""
+    return [MethodRun(n, how(rate) + each, method, at_rate(method, rate), rate)
+            for n, rate in zip(names, rates if _continuous(method) else _sampled(method, rates), strict=True)]
 
 
 def how(hold: int | None, delay: float = 0.0) -> str:
@@ -164,7 +195,12 @@ def how(hold: int | None, delay: float = 0.0) -> str:
     return text + (f", {1e3 * delay:.3g} ms late" if delay else "")
 
 
-def at_rate(method: Any, hold: int) -> Any:
+def _continuous(method: Any) -> bool:
+    """Whether it is made at each p, and continuous there."""
+    return isinstance(method, Laws) and method.continuous
+
+
+def at_rate(method: Any, hold: int | None) -> Any:
     """NMPC's loop plans for the rate that it is run at; other callables need not know it."""
     return Loop(method.nmpc, hold, method.receding) if isinstance(method, Loop) else method
 
@@ -181,14 +217,20 @@ def own_rate(ocp: OCP, method: Any) -> int | None:
 
 
 def _policy(ocp: OCP, name: str, method: Any) -> ca.Function | None:
+    found: ca.Function | None = _named(name, policy_function, ocp, method)
+    return found
+
+
+def _named(name: str, check: Callable[[OCP, Any], Any], ocp: OCP, method: Any) -> Any:
+    """check(ocp, method), its error with the method's name before it."""
     try:
-        return policy_function(ocp, method)
+        return check(ocp, method)
     except ValueError as error:
         raise ValueError(f"method {name!r}: {error}") from error
 
 
-def _check_solution(ocp: OCP, name: str, solution: Solution, x0: Array) -> None:
-    B = len(x0)
+def _check_solution(ocp: OCP, name: str, solution: Solution, starts: Starts) -> None:
+    x0, B = starts.x, len(starts)
     if solution.u.ndim != 3 or len(solution.u) != B or solution.u.shape[2] != ocp.system.nu:
         raise ValueError(f"method {name!r} is a Solution with controls {solution.u.shape}; expected [{B}, K, "
                          f"{ocp.system.nu}], one solution for each of the {B} initial states: pass its x0 to compare")
@@ -198,6 +240,10 @@ def _check_solution(ocp: OCP, name: str, solution: Solution, x0: Array) -> None:
     if away.size:
         raise ValueError(f"method {name!r} solves state {away[0]} from {solution.x[away[0], 0].tolist()}, but the "
                          f"comparison starts it at {x0[away[0]].tolist()}: pass the Solution's x0 to compare")
+    low, high = ocp.parameter_box
+    if solution.p is not None and not np.allclose(solution.p, starts.p, rtol=0, atol=SAME_STATE * (high - low)):
+        raise ValueError(f"method {name!r} solves other parameters than those of the comparison: pass the Solution's "
+                         "x0 and p to compare")
     if wrong := _off_grid(ocp, solution):
         raise ValueError(f"method {name!r}: {wrong}")
 
@@ -212,19 +258,20 @@ def _off_grid(ocp: OCP, solution: Solution) -> str:
             f"expected equal steps from 0 to the horizon {ocp.horizon:g}: compare it in closed loop, by controller()")
 
 
-def solve(solver: Any, name: str, x0: Array, solving: Solving) -> list[Solution | str]:
+def solve(ocp: OCP, solver: Any, name: str, x0: Starts, solving: Solving) -> list[Solution | str]:
     """The Solution of all states at once; where that raises, state by state, what was raised instead."""
     out = None if solving.out is None else solving.out / "solves" / folder_name(name)
-    given = {"workers": solving.workers, "out": out, "progress": solving.progress}
+    p = x0.p if takes_p(ocp, solver) else None
+    given = {"workers": solving.workers, "out": out, "progress": solving.progress, "p": p}
     takes = inspect.signature(solver.solve).parameters
     options = {key: value for key, value in given.items() if key in takes}
     try:
-        solution = solver.solve(x0, **options)
+        solution = solver.solve(x0.x, **options)
     except Exception as error:  # a solver may raise anything: it becomes a row
         if len(x0) == 1:
             return [said(error)]
         alone = Solving(1, None, solving.progress)
-        return [solve(solver, name, x[None], alone)[0] for x in x0]
+        return [solve(ocp, solver, name, x0[[i]], alone)[0] for i in range(len(x0))]
     return [solution]
 
 

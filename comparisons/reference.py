@@ -32,14 +32,14 @@ class Reference:
     def __init__(self, ocp: OCP, intervals: int, guesses: Sequence[Array] = ()) -> None:
         self.ocp, self.intervals, self.guesses = ocp, intervals, list(guesses)
 
-    def solve(self, x0: Array) -> Solution:
-        """The best solution of each state x0 [B, nx]; guesses are of the same states."""
+    def solve(self, x0: Array, p: Array | None = None) -> Solution:
+        """The best solution of each state x0 [B, nx], p [B, np]; guesses are of the same."""
         ddp = DDP(self.ocp, intervals=self.intervals, constraints="soft")
-        best = ddp.solve(x0)
-        goal = np.asarray(self.ocp.u_goal)
+        best = ddp.solve(x0, p=p)
+        goal = self.ocp.goals(np.zeros((len(x0), 0)) if p is None else p)[1][:, None]
         for guess in self.guesses:
             u = guess[:, np.arange(self.intervals) * guess.shape[1] // self.intervals]
-            best = better(best, ddp.solve(x0, u=np.ascontiguousarray(np.where(np.isfinite(u), u, goal))))
+            best = better(best, ddp.solve(x0, u=np.ascontiguousarray(np.where(np.isfinite(u), u, goal)), p=p))
         return best
 
 

@@ -16,11 +16,14 @@ import casadi as ca
 import numpy as np
 from scipy.integrate import solve_ivp
 
+from nocl.comparisons.at_each import Laws
+from nocl.comparisons.methods import Starts
 from nocl.comparisons.report.findings import Stability
 from nocl.comparisons.report.report import Report
 from nocl.comparisons.report.results import (
     REFERENCE,
 )
+from nocl.data import Solution
 from nocl.judge import policy_function
 from nocl.ocp import OCP
 from nocl.scales import usual_sizes
@@ -38,42 +41,44 @@ def stability(report: Report, methods: Mapping[str, Any]) -> tuple[Stability, ..
     """Each method with a policy (x, t) -> u in CasADi, LQR and the optimum's feedback, at both places.
 
     Where the goal pair is no equilibrium, or LQR has no answer, LQR is left out; a closed loop that is not finite at a
-    point leaves that method out there.
+    point leaves that method out there. On a problem with parameters the goal is that of the nominal ones, where methods
+    that are made for each p are made anew, and trajectories have their own.
     """
     ocp = report.ocp
-    policies = {name: policy for name, method in methods.items()
-                if (policy := policy_function(ocp, method)) is not None}
+    policies = {name: policy for name, method in methods.items() if not isinstance(method, Laws)
+                and (policy := policy_function(ocp, method)) is not None}
     if "LQR" not in policies:
         policies |= _lqr(ocp)
-    goal, middle = ocp.x_goal[None], _middle(report)
+    goal, middle = Starts(ocp.x_goal[None], ocp.nominal[None]), _middle(report)
     places = [("goal", LATE * ocp.horizon, goal), ("mid-horizon", MIDDLE * ocp.horizon, middle)]
-    found = [local(ocp, name, policy, where, t, x) for where, t, x in places if len(x)
-             for name, policy in policies.items()]
+    found = [local(ocp, name, policy, where, t, at.x, at.p) for where, t, at in places if len(at)
+             for name, policy in policies.items() if where == "goal" or not (name == "LQR" and ocp.np)]
     return tuple([s for s in found if s is not None] + _optimum(report))
 
 
-def local(ocp: OCP, name: str, policy: ca.Function, where: str, t: float, x: Array) -> Stability | None:
-    """A policy at points x [P, nx] and time t."""
-    s = ocp.system
+def local(ocp: OCP, name: str, policy: ca.Function, where: str, t: float, x: Array, p: Array) -> Stability | None:
+    """A policy at points x [P, nx], parameters p [P, np] and time t."""
+    s, given = ocp.system, [[row] if ocp.np else [] for row in p]
     at = ocp.functions.feedback(ca.MX)
     u = ca.fmin(ca.fmax(policy(*at.inputs), s.lbu), s.ubu)
     xdot = at.given(u=u).call(ocp.functions.f)
     loop = at.function("loop", {"xdot": xdot, "A": ca.densify(ca.jacobian(xdot, at["x"])),
                                 "K": ca.densify(ca.jacobian(u, at["x"]))})
-    parts = [loop(row, t) for row in x]
+    parts = [loop(row, t, *more) for row, more in zip(x, given, strict=True)]
     A, K = (np.array([part[i].full() for part in parts]) for i in (1, 2))
     if not np.isfinite(A).all():
         return None
-    growth = np.array([_growth(loop, row, t, ocp.horizon, usual_sizes(ocp).x) for row in x])
+    size = usual_sizes(ocp).x
+    growth = np.array([_growth(loop, row, more, t, ocp.horizon, size) for row, more in zip(x, given, strict=True)])
     return Stability(name, where, t, _eigenvalues(A), K, growth)
 
 
-def _growth(loop: ca.Function, x: Array, t: float, T: float, size: Array) -> float:
+def _growth(loop: ca.Function, x: Array, p: list[Array], t: float, T: float, size: Array) -> float:
     """||Phi(T, t)||_2 along the closed loop's own run from x at t; inf where it is lost."""
     n, sizes = len(x), np.r_[size, np.divide.outer(size, size).ravel()]  # of x and Phi
 
     def field(time: float, z: Array) -> Array:
-        xdot, A, _ = loop(z[:n], time)
+        xdot, A, _ = loop(z[:n], time, *p)
         return np.r_[xdot.full().ravel(), (A.full() @ z[n:].reshape(n, n)).ravel()]
 
     path = solve_ivp(field, (t, T), np.r_[x, np.eye(n).ravel()], rtol=1e-6, atol=1e-8 * sizes)
@@ -88,28 +93,31 @@ def _eigenvalues(A: Array) -> Any:
 
 
 def _lqr(ocp: OCP) -> dict[str, ca.Function]:
+    """LQR about the goal, that of the nominal parameters."""
     try:
-        return {"LQR": LQR(ocp).to_casadi()}
-    except ValueError:  # the goal pair is no equilibrium, or L not convex there
+        law = policy_function(ocp, LQR(ocp.folded(ocp.nominal)))
+    except ValueError:  # the goal pair is no equilibrium, L not convex there, or it holds the time
         return {}
+    return {} if law is None else {"LQR": law}
 
 
-def _best_controls(report: Report) -> tuple[Array, Array] | None:
-    """(states of POINTS rows, controls [P, K, nu] of the reference's or another solver's plan)."""
+def _best_controls(report: Report) -> tuple[Starts, Array] | None:
+    """(POINTS rows, controls [P, K, nu] of the reference's or another solver's plan)."""
     planned = sorted((j for j in report.judged if j.plan is not None), key=lambda j: j.name != REFERENCE)
     if not planned:
         return None
     u = planned[0].simulation.u[:, :-1]
     rows = np.flatnonzero(np.isfinite(u).all(axis=(1, 2)))[:POINTS]
-    return (report.x0[rows], u[rows]) if rows.size else None
+    return (Starts(report.x0[rows], report.parameters[rows]), u[rows]) if rows.size else None
 
 
-def _middle(report: Report) -> Array:
+def _middle(report: Report) -> Starts:
     """States at mid-horizon [P, nx] of the best known plans; of the first method's runs where nobody plans."""
     planned = sorted((j for j in report.judged if j.plan is not None), key=lambda j: j.name != REFERENCE)
     judged = planned[0] if planned else report.judged[0]
     x = (judged.simulation.x if judged.plan is None else judged.plan.x)[:, (len(judged.simulation.t) - 1) // 2]
-    return x[np.isfinite(x).all(axis=1)][:POINTS]
+    rows = np.flatnonzero(np.isfinite(x).all(axis=1))[:POINTS]
+    return Starts(x[rows], report.parameters[rows])
 
 
 def _optimum(report: Report) -> list[Stability]:
@@ -117,29 +125,31 @@ def _optimum(report: Report) -> list[Stability]:
     given, ocp = _best_controls(report), report.ocp
     if given is None:
         return []
-    x0, u = given
+    starts, u = given
     K = INTERVALS // u.shape[1] * u.shape[1] or u.shape[1]
     ddp = DDP(ocp, intervals=K, constraints="soft")
-    found = ddp.solve(x0, u=np.ascontiguousarray(np.repeat(u, K // u.shape[1], axis=1)))
+    guess = np.ascontiguousarray(np.repeat(u, K // u.shape[1], axis=1))
+    found = ddp.solve(starts.x, u=guess, p=starts.p if ocp.np else None)
     found = found[found.success]
     if not len(found):
         return []
     k, h = K // 2, ocp.horizon / K
-    linear = ocp.functions.jacobian
-    jacobians = [[j.full() for j in linear(found.x[i, k], found.u[i, k])] for i in range(len(found))]
+    of, p = ocp.functions, found.parameters
+    jacobians = [[j.full() for j in of.jacobian(*of.arguments.columns(
+        x=found.x[[i], k], u=found.u[[i], k], t=[k * h], p=p[[i]]))] for i in range(len(found))]
     A = np.array([A + B @ found.gain[i, k] for i, (A, B) in enumerate(jacobians)])
-    growth = np.array([np.linalg.norm(_transition(ocp, found.x[i, k:], found.u[i, k:], found.gain[i, k:], h), 2)
-                       for i in range(len(found))])
+    growth = np.array([np.linalg.norm(_transition(ocp, found[[i]], k), 2) for i in range(len(found))])
     return [Stability(OPTIMUM, "mid-horizon", k * h, _eigenvalues(A), found.gain[:, k], growth)]
 
 
-def _transition(ocp: OCP, x: Array, u: Array, gain: Array, h: float) -> Array:
-    """The product of the closed loop's Jacobians over RK4 steps of length h, [nx, nx]."""
-    at = ocp.functions.stage
-    after, _ = at.interval(h)
+def _transition(ocp: OCP, plan: Solution, first: int) -> Array:
+    """The product of the closed loop's Jacobians over the RK4 steps of a solution from one on, [nx, nx]."""
+    at, t = ocp.functions.stage, plan.t[0]
+    after, _ = at.interval(t[1] - t[0])
     step = at.function("step", {"A": ca.densify(ca.jacobian(after, at.x)), "B": ca.densify(ca.jacobian(after, at.u))})
     Phi = np.eye(ocp.system.nx)
-    for k in range(len(u)):
-        by_x, by_u = (j.full() for j in step(x[k], u[k]))
-        Phi = (by_x + by_u @ gain[k]) @ Phi
+    for k in range(first, plan.u.shape[1]):
+        given = at.columns(x=plan.x[:, k], u=plan.u[:, k], t=t[[k]], p=plan.parameters)
+        by_x, by_u = (j.full() for j in step(*given))
+        Phi = (by_x + by_u @ plan.gain[0, k]) @ Phi
     return Phi

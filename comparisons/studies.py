@@ -29,22 +29,25 @@ def study(ocp: OCP, methods: Mapping[str, Any], n: int = 200, x0: ArrayLike | No
           hold: int | Sequence[int | None] | None = None, model: Any = None, robust: bool = False,
           variants: Mapping[str, Any] | None = None, disturbances: Disturbances | None = None,
           workers: int | str = "auto", out: str | os.PathLike[str] | None = None,
-          progress: bool | None = None) -> Report:
+          progress: bool | None = None, p: Any = None) -> Report:
     """Everything about `methods`: compare's rows with a reference beside them, audits, promises, stability.
 
     Parameters
     ----------
-    ocp, methods, n, x0, seed, hold, workers, out, progress : as compare has them
+    ocp, methods, n, x0, seed, hold, workers, out, progress, p : as compare has them
     model : the learned dynamics that the controls were made on, for the audits' rollouts
     robust : also the disturbances, on the first ROBUST states (NMPC in closed loop beside its plans), and the region
-        of initial states where each feedback law works
+        of initial states where each feedback law works; ValueError where the problem has parameters or holds the time
     variants, disturbances : of robustness
 
     The reference is DDP's on FINE intervals, from what each method found; it is judged like the others. With `out`
     solves and judged runs are kept; the reference, audits, optima under disturbances and regions are found anew.
     """
     folder = None if out is None else Path(out)
-    report = compare(ocp, methods, n, x0, seed, hold, workers, None if folder is None else folder / "compare", progress)
+    if robust:
+        ocp.refuse_parameters("study(robust=True)")
+    report = compare(ocp, methods, n, x0, seed, hold, workers, None if folder is None else folder / "compare", progress,
+                     p)
     report = with_reference(report, FINE, workers, progress)
     report = replace(report, audits=audit(report, methods, model), promises=promises(report),
                      stability=stability(report, methods))
@@ -61,7 +64,7 @@ def with_reference(report: Report, intervals: int, workers: int | str = 1, progr
     """The report with the reference as its last method, from the controls of all that are there."""
     guesses = [j.simulation.u[:, :-1] for j in report.judged]
     found = compare(report.ocp, {NAME: Reference(report.ocp, intervals, guesses)}, x0=report.x0, workers=workers,
-                    progress=progress)
+                    progress=progress, p=report.p if report.ocp.np else None)
     return replace(report, judged=(*report.judged, *found.judged), seconds=report.seconds + found.seconds)
 
 

@@ -224,7 +224,10 @@ def takes_p(ocp: OCP, controller: Any) -> bool:
     return bool(ocp.np) and not (isinstance(made_for, OCP) and not made_for.np)
 
 
-def _check_takes_p(ocp: OCP, controller: Any) -> None:
+def check_takes_p(ocp: OCP, controller: Any) -> None:
+    """ValueError where a callable controller is one of (x, t) and should be one of (x, t, p)."""
+    if not takes_p(ocp, controller):
+        return
     try:
         inspect.signature(controller).bind(None, 0.0, None)
     except TypeError:
@@ -241,8 +244,8 @@ def _feedback(ocp: OCP, controller: Any, policy: ca.Function | None, p: Array) -
         raise ValueError(f"the controller is a {type(controller).__name__}; expected a callable (x, t) -> u, "
                          "a casadi.Function, an object with to_casadi(), or controls [B, K, nu]")
     more = [p] if takes_p(ocp, controller) else []
-    if policy is None and more:
-        _check_takes_p(ocp, controller)
+    if policy is None:
+        check_takes_p(ocp, controller)
     columns = [p.T] if ocp.np else []
 
     def ask(x: Array, t: float, k: int) -> Array:

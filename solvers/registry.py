@@ -40,6 +40,7 @@ class Method:
     takes: tuple[str, ...] = ()  # fields of Options
     extra: str = ""  # of the package, where the method needs one
     modules: tuple[str, ...] = ()  # that the extra brings
+    p: str = "rows"  # "rows": it takes a p for each state; "each": it is made anew at each; "one": it is made for one p
 
     @property
     def missing(self) -> str:
@@ -52,10 +53,20 @@ class Method:
         """ValueError, without long work, where the method cannot be made for this problem."""
         if self.missing:
             raise ValueError(self.missing)
+        self.check_parameters(ocp)
+        if self.p == "each":
+            ocp = ocp.folded(ocp.nominal)
         if self.check:
             _function(self.check)(ocp)
         elif self.make:
             self.build(ocp, options)
+
+    def check_parameters(self, ocp: OCP) -> None:
+        """ValueError where it is made for one p, and the problem has many."""
+        if self.p == "one" and ocp.np:
+            raise ValueError(f"{self.name} ({self.about}) is made for one p, and the problem on {ocp.system.name!r} "
+                             f"has the parameter(s) {', '.join(ocp.parameter_names)}; expected a problem without: "
+                             f"ocp.at(p=...), at the command line {asked(ocp)}")
 
     def build(self, ocp: OCP, options: Options) -> Any:
         """The method for this problem."""
@@ -71,24 +82,31 @@ def _function(name: str) -> Callable[..., Any]:
     return found
 
 
+def asked(ocp: OCP) -> str:
+    """The option that chooses one p, with the nominal ones for an example."""
+    values = zip(ocp.parameter_names, ocp.nominal.tolist(), strict=True)
+    return "--p " + ",".join(f"{name}={value:g}" for name, value in values)
+
+
 PLANS = ("intervals", "seed", "substeps")  # what plans take
 
 METHODS: dict[str, Method] = {method.name: method for method in (
     Method("cnd", "CND", "the run's own controller"),
     Method("nmpc", "NMPC", "multiple shooting, in open loop", "nocl.solvers.nmpc.solver:NMPC",
            takes=PLANS),
-    Method("lqr", "LQR", "linear feedback about the goal", "nocl.solvers.lqr:LQR"),
+    Method("lqr", "LQR", "linear feedback about the goal", "nocl.solvers.lqr:LQR", p="each"),
     Method("ddp", "DDP", "the best of many starts, in open loop", "nocl.solvers.ddp.global_search:global_ddp",
            takes=PLANS),
     Method("nmpc-loop", "NMPC-LOOP", "NMPC in closed loop", "nocl.solvers.nmpc.solver:closed_loop",
            takes=PLANS),
     Method("neural-oc", "NeuralOC", "a value network, trained for minutes to hours on the exact f",
-           "nocl.solvers.neural_oc:train_neural_oc", check="nocl.solvers.neural_oc:applicable", takes=("seed",)),
+           "nocl.solvers.neural_oc:train_neural_oc", check="nocl.solvers.neural_oc:applicable", takes=("seed",),
+           p="one"),
     Method("level-sets", "level sets", "the HJB equation on a grid, up to 3 states",
            "nocl.solvers.levelset.solver:standard_solution", check="nocl.solvers.levelset.solver:standard",
-           extra="levelset", modules=("hj_reachability", "jax")),
+           extra="levelset", modules=("hj_reachability", "jax"), p="one"),
     Method("rrt-star", "RRT*", "shortest paths, of kinematic cars only", "nocl.solvers.rrt_star:standard",
-           takes=("seed",), extra="ompl", modules=("ompl",)),
+           takes=("seed",), extra="ompl", modules=("ompl",), p="each"),
 )}
 
 

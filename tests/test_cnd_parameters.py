@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from lq import lq_value
+from movers import mover
 
 import nocl
 from nocl.solvers import DDP, NMPC
@@ -18,17 +19,6 @@ QUICK = TrainSettings(intervals=40, seeds=8, starts=2, states=100, tails=800, vi
                       batch=512, hidden=(32, 32), value_initial=200, value_tails=1000, value_visits=200,
                       value_iterations=1000, value_rounds=1, held_out=16, gap_median=1e-9)
 P = np.array([[1.0, 0.0], [0.8, 1.0], [1.2, -1.0], [1.1, 0.4]])  # (mass, goal)
-
-
-def mover(**change: object) -> nocl.OCP:
-    """The double integrator of some mass, to rest at a goal."""
-    x, u = ca.vertcat(ca.SX.sym("pos"), ca.SX.sym("v")), ca.SX.sym("u")
-    mass, goal = nocl.parameter("mass", nominal=1.0, unit="kg"), nocl.parameter("goal", unit="m")
-    s = nocl.System("mover", x=x, u=u, p=mass, xdot=ca.vertcat(x[1], u / mass), lbu=[-20], ubu=[20], lbx=[-4, -4],
-                    ubx=[4, 4])
-    options = {"p": goal, "horizon": 2.0, "R": 0.01, "x_goal": [goal, 0], "u_goal": [0],
-               "initial_states": nocl.Gaussian([0, 0], [0.5, 0.5]), "parameters": nocl.Uniform([0.8, -1], [1.2, 1])}
-    return nocl.OCP.quadratic(s, **{**options, **change})
 
 
 @pytest.fixture(scope="module")

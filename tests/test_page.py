@@ -119,11 +119,12 @@ def test_the_cost_to_go_starts_at_the_judged_cost_and_is_the_value_of_lqr():
     """Along LQR's run of a linear-quadratic problem what is still to pay is x' S(t) x, at every node."""
     ocp = double_integrator.ocp()
     lqr = LQR(ocp)
-    j = compare(ocp, {"LQR": lqr}, n=3, progress=False).judged[0]
-    left = packing.cost_to_go(ocp, j)
+    report = compare(ocp, {"LQR": lqr}, n=3, progress=False)
+    j = report.judged[0]
+    left = packing.cost_to_go(report, j)
     np.testing.assert_allclose(left[:, 0], j.simulation.cost, rtol=1e-12)
     np.testing.assert_allclose(left[:, -1], j.simulation.terminal_cost, rtol=1e-12)
-    V = packing.values_along(j, j.simulation.t, j.simulation.x)
+    V = packing.values_along(j, j.simulation.t, j.simulation.x, report.parameters)
     np.testing.assert_allclose(left, V, atol=2e-3 * V.max())
 
 

@@ -14,7 +14,6 @@ from scipy.integrate import solve_ivp
 
 import nocl
 from nocl import parameters
-from nocl.cli.commands import main
 from nocl.nets import MLP, FeatureNet
 from nocl.sampling import own_numbers
 from nocl.scales import usual_sizes
@@ -248,7 +247,6 @@ def test_kinks_count_in_states_and_controls_only():
 
 
 REFUSED = [("train(method='paper')", lambda ocp: nocl.train(ocp, method="paper")), ("LQR", LQR),
-           ("compare", lambda ocp: nocl.comparisons.compare(ocp, {})),
            ("RRTStar", lambda ocp: RRTStar(ocp, iterations=5)), ("to_gymnasium", nocl.to_gymnasium)]
 
 
@@ -266,14 +264,6 @@ def test_what_has_no_parameters_yet_says_so(owner, use):
 def test_a_system_with_parameters_is_refused_where_nothing_is_done_with_them(use):
     with pytest.raises(ValueError, match=r"not implemented for the parameter\(s\) mass.*system.at\(p="):
         use(cart(timed=False).system)
-
-
-def test_the_command_line_refuses_them(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("nocl.cli.commands.load_ocp", lambda name: cart())
-    assert main(["solve", "cart"]) == 2
-    assert "the command line is not implemented for the parameter(s) mass, goal" in capsys.readouterr().err
-    assert not list(tmp_path.iterdir())
 
 
 def test_folded_in_they_are_anybodys():

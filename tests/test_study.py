@@ -172,7 +172,7 @@ def test_stability_of_a_linear_loop_is_known(ocp):
     K = np.array([[4.0, 3.0]])
     x, t = ca.MX.sym("x", 2), ca.MX.sym("t")
     policy = ca.Function("policy", [x, t], [-ca.mtimes(K, x)])
-    found = local(ocp, "PD", policy, "goal", 0.5, np.zeros((1, 2)))
+    found = local(ocp, "PD", policy, "goal", 0.5, np.zeros((1, 2)), np.zeros((1, 0)))
     A = np.array([[0.0, 1.0], [-4.0, -3.0]])
     np.testing.assert_allclose(np.sort_complex(found.eigenvalues[0]), np.sort_complex(np.linalg.eigvals(A)), rtol=1e-9)
     assert found.growth[0] == pytest.approx(np.linalg.norm(expm(1.5 * A), 2), rel=1e-4)

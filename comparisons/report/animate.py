@@ -84,7 +84,7 @@ def _state(report: Results, state: int | None, chosen: Sequence[int]) -> int:
 
 
 def _set_up(report: Results, i: int, chosen: Sequence[int], draw: Draw) -> tuple[Figure, Callable[[float], list[Any]]]:
-    ocp, n = report.ocp, len(chosen)
+    ocp, n = report.at(i), len(chosen)
     figure = Figure(figsize=(4.1 * n, 4.6), dpi=DPI)
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, n, height_ratios=[3.2, 1], left=0.17 / n, right=1 - 0.06 / n, top=0.86, bottom=0.11,

@@ -137,7 +137,8 @@ def _forbidden(ax: Any, ocp: OCP, low: Array, high: Array) -> None:
     a, b = (np.linspace(low[c], high[c], 160) for c in (0, 1))
     x = np.tile(ocp.x_goal, (a.size * b.size, 1))
     x[:, 0], x[:, 1] = (v.ravel() for v in np.meshgrid(a, b))
-    h = ocp.h(x.T).full().min(axis=0).reshape(b.size, a.size)
+    given = ocp.functions.node.columns(x=x, t=np.zeros(len(x)))  # where the obstacles move, as they begin
+    h = ocp.h(*given).full().min(axis=0).reshape(b.size, a.size)
     ax.contourf(a, b, h, levels=[-np.inf, 0.0], colors=[LIGHT])
 
 

@@ -78,7 +78,7 @@ def _lost_where(report: Results, m: int, b: int, i: int) -> str:
     ours, best = report.judged[m].simulation, report.judged[b].simulation
     running = float(ours.running_cost[i] - best.running_cost[i])
     terminal = float(ours.terminal_cost[i] - best.terminal_cost[i])
-    error = report.ocp.from_goal(ours.x[i, -1])
+    error = report.ocp.from_goal(ours.x[i, -1], report.parameters[i])
     k = int(np.abs(error).argmax())
     name = report.ocp.system.state_names[k]
     unit = report.ocp.system.units.get(name, "")
@@ -131,7 +131,7 @@ class _Ways:
         sd = known.std(axis=0) if len(known) else np.ones(values.shape[1])
         self.sd = np.where(sd > 0, sd, 1.0)
         self.z = [part / self.sd for part in x]  # [methods] of [B, NODES, nx]
-        self.near = _nearest(report.x0)
+        self.near = _nearest(report.starts)
 
     def part(self, m: int, i: int, n: int, k: int) -> bool:
         """Whether method m's run from state i and method n's from k part."""

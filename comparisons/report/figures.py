@@ -98,7 +98,8 @@ def trajectories(report: Results, states: Sequence[int]) -> Figure:
         for m, judged in enumerate(report.judged):
             _draw_run(axes[:, c], judged.simulation.t, judged.simulation.x[i], judged.simulation.u[i], m, judged.name,
                       steps=judged.held)
-        for ax, goal in zip(axes[:, c], np.r_[report.ocp.x_goal, report.ocp.u_goal], strict=True):
+        goals = np.concatenate(report.ocp.goals(report.parameters[[i]]), axis=1)[0]
+        for ax, goal in zip(axes[:, c], goals, strict=True):
             ax.axhline(goal, color="0.6", linewidth=0.7, zorder=0)
     for ax, name in zip(axes[:, 0], names, strict=True):
         ax.set_ylabel(name)

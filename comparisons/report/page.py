@@ -58,6 +58,7 @@ def _finite(data: Any) -> Any:
 
 def _what(report: Results) -> str:
     how = str(report.settings.get("initial states", ""))
+    how += f", each at its own {', '.join(report.ocp.parameter_names)}" if report.ocp.np else ""
     return f"{count(len(report.x0), 'initial state')} {how}, {count(len(report.judged), 'method')}."
 
 

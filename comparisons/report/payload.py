@@ -45,7 +45,7 @@ def payload(report: Results) -> dict[str, Any]:
     nodes, states = kept
     return {"name": s.name, "states": s.state_names, "controls": s.control_names,
             "labels": [s.unit(name) for name in s.names], "horizon": report.ocp.horizon,
-            "goal": [*report.ocp.x_goal.tolist(), *report.ocp.u_goal.tolist()],
+            "goal": [*report.ocp.x_goal.tolist(), *report.ocp.u_goal.tolist()], **_parameters(report),
             "lbu": s.lbu.tolist(), "ubu": s.ubu.tolist(), "explained": explained_method(report),
             "numbers": list(NUMBERS),
             "channels": channels(report), "B": len(report.x0), "x0": floats(report.x0), "gap": floats(report.gap),
@@ -54,6 +54,16 @@ def payload(report: Results) -> dict[str, Any]:
             "methods": [_method(report, j, nodes, states) for j in report.judged],
             "kept": None if len(states) == len(report.x0) else states.tolist(),
             "plane": plane(report), "obstacles": obstacles(report), "slices": slices(report), **_study(report)}
+
+
+def _parameters(report: Results) -> dict[str, Any]:
+    """The parameters of each state, and its goal where that depends on them."""
+    ocp, p = report.ocp, report.parameters
+    if not ocp.np:
+        return {}
+    goals = {"goals": floats(np.concatenate(ocp.goals(p), axis=1))} if ocp.goal_varies else {}
+    return {"parameters": ocp.parameter_names, "plabels": [ocp.unit(name) for name in ocp.parameter_names],
+            "p": floats(p), "nominal": ocp.nominal.tolist(), **goals}
 
 
 def floats(values: ArrayLike) -> str:
@@ -94,10 +104,11 @@ def _index(report: Results, i: int) -> int:
 def _method(report: Results, j: Judged, nodes: int, states: NDArray[np.integer[Any]]) -> dict[str, Any]:
     s = j.simulation
     index = np.unique(np.rint(np.linspace(0, len(s.t) - 1, min(nodes, len(s.t)))).astype(int))
-    parts = [s.x[states], s.u[states], cost_to_go(report.ocp, j)[states, :, None]]  # in the order of `channels`
+    parts = [s.x[states], s.u[states], cost_to_go(report, j)[states, :, None]]  # in the order of `channels`
     run = np.concatenate([part[:, index] for part in parts], axis=2)
     if (owner := valued(report)) is not None:
-        run = np.concatenate([run, values_along(owner, s.t[index], s.x[states][:, index])[..., None]], axis=2)
+        along = values_along(owner, s.t[index], s.x[states][:, index], report.parameters[states])
+        run = np.concatenate([run, along[..., None]], axis=2)
     numbers = np.stack([read(j) for read in NUMBERS.values()], axis=1)
     failed = {str(i): str(s.message[i]) for i in np.flatnonzero(~np.asarray(s.success, dtype=bool))}
     return {"name": j.name, "how": j.how, "held": j.held, "t": s.t[index].tolist(), "failed": failed,
@@ -118,11 +129,12 @@ def quantised(run: Array) -> dict[str, str]:
             "limits": floats(np.stack([low[:, 0], high[:, 0]], axis=-1))}
 
 
-def cost_to_go(ocp: OCP, j: Judged) -> Array:
+def cost_to_go(report: Results, j: Judged) -> Array:
     """[B, K+1], what a run still costs at its nodes: L by trapezoids, scaled so that it starts at the judged cost."""
-    s = j.simulation
+    s, ocp, p = j.simulation, report.ocp, report.parameters
     end = s.u[:, :-1] if j.held else s.u[:, 1:]
-    steps = 0.5 * np.diff(s.t) * (_running(ocp, s.x[:, :-1], s.u[:, :-1]) + _running(ocp, s.x[:, 1:], end))
+    first, last = _running(ocp, s.t[:-1], s.x[:, :-1], s.u[:, :-1], p), _running(ocp, s.t[1:], s.x[:, 1:], end, p)
+    steps = 0.5 * np.diff(s.t) * (first + last)
     total = steps.sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         steps = steps * np.where(np.abs(total) > 0, s.running_cost / total, 1.0)[:, None]
@@ -130,23 +142,24 @@ def cost_to_go(ocp: OCP, j: Judged) -> Array:
         return np.asarray(left + s.terminal_cost[:, None])
 
 
-def _running(ocp: OCP, x: Array, u: Array) -> Array:
-    """[B, K], L at x [B, K, nx], u [B, K, nu]."""
-    flat = ocp.L(x.reshape(-1, x.shape[2]).T, u.reshape(-1, u.shape[2]).T).full()
-    return flat.reshape(x.shape[:2])
+def _running(ocp: OCP, t: Array, x: Array, u: Array, p: Array) -> Array:
+    """[B, K], L at t [K], x [B, K, nx], u [B, K, nu], p [B, np]."""
+    (B, K), of = x.shape[:2], ocp.functions
+    given = of.arguments.columns(x=x.reshape(B * K, -1), u=u.reshape(B * K, -1), t=np.tile(t, B), p=np.repeat(p, K, 0))
+    return np.asarray(of.L(*given).full().reshape(B, K))
 
 
-def values_along(owner: Judged, t: Array, x: Array) -> Array:
-    """[n, K], the owner's V along the runs x [n, K, nx]."""
-    return np.stack([_values(owner, x[:, k], float(t[k])) for k in range(len(t))], axis=1)
+def values_along(owner: Judged, t: Array, x: Array, p: Array) -> Array:
+    """[n, K], the owner's V along the runs x [n, K, nx] at parameters p [n, np]."""
+    return np.stack([_values(owner, x[:, k], float(t[k]), p) for k in range(len(t))], axis=1)
 
 
-def _values(owner: Judged, x: Array, t: float) -> Array:
-    """[n], V(x, t), NaN where x is not finite."""
+def _values(owner: Judged, x: Array, t: float, p: Array) -> Array:
+    """[n], V(x, t[, p]), NaN where x is not finite."""
     known = np.isfinite(x).all(axis=1)
     V = np.full(len(x), np.nan)
     if owner.value is not None and known.any():
-        V[known] = np.asarray(owner.value(x[known], t), dtype=float).reshape(-1)
+        V[known] = np.asarray(owner.value(x[known], t, p[known]), dtype=float).reshape(-1)
     return V
 
 
@@ -187,12 +200,12 @@ def visited(report: Results) -> tuple[Array, Array]:
 
 
 def _obstacle_pairs(ocp: OCP) -> dict[tuple[int, int], list[int]]:
-    """Path constraints by the two coordinates that they depend on, where it is two."""
+    """Path constraints by the two coordinates that they depend on, where it is two; not those that move with t or p."""
     pairs: dict[tuple[int, int], list[int]] = {}
-    x = ocp.functions.node["x"]
+    at = ocp.functions.node
     for c, h in enumerate(ca.vertsplit(ocp.functions.constraints)):
-        on = [k for k in range(ocp.system.nx) if ca.depends_on(h, x[k])]
-        if len(on) == 2:
+        on = [k for k in range(ocp.system.nx) if ca.depends_on(h, at["x"][k])]
+        if len(on) == 2 and not any(ca.depends_on(h, at[name]) for name in at.names if name != "x"):
             pairs.setdefault((on[0], on[1]), []).append(c)
     return pairs
 
@@ -204,13 +217,18 @@ def obstacles(report: Results) -> list[dict[str, Any]]:
     for (i, k), which in _obstacle_pairs(report.ocp).items():
         x = np.tile(report.ocp.x_goal, (OUTLINE**2, 1))
         x[:, i], x[:, k] = (v.ravel() for v in np.meshgrid(*(np.linspace(low[c], high[c], OUTLINE) for c in (i, k))))
-        h = report.ocp.h(x.T).full()[which].min(axis=0)
+        of, n = report.ocp.functions, len(x)
+        given = of.node.columns(x=x, t=np.zeros(n), p=np.tile(report.ocp.nominal, (n, 1)))  # of which these are free
+        h = of.h(*given).full()[which].min(axis=0)
         found.append({"i": i, "k": k, "x": [low[i], high[i]], "y": [low[k], high[k]], "n": OUTLINE, "h": floats(h)})
     return found
 
 
 def slices(report: Results) -> dict[str, Any] | None:
-    """V over pairs of coordinates at some times, the others as in the median run; None without a value function."""
+    """V over pairs of coordinates at some times, the others as in the median run, at the nominal parameters.
+
+    None without a value function.
+    """
     owner = valued(report)
     if owner is None:
         return None
@@ -225,19 +243,20 @@ def slices(report: Results) -> dict[str, Any] | None:
     if not pairs or not ok.any():
         return None
     base = [np.median(s.x[ok, k], axis=0) for k in nodes]
-    V = [[_slice(owner, b, pair, low, high, float(s.t[k])) for b, k in zip(base, nodes, strict=True)]
+    p = report.ocp.nominal
+    V = [[_slice(owner, b, pair, low, high, float(s.t[k]), p) for b, k in zip(base, nodes, strict=True)]
          for pair in pairs]
     return {"method": owner.name, "pairs": [[int(k) for k in pair] for pair in pairs],
             "t": [float(s.t[k]) for k in nodes], "n": GRID, "base": np.array(base).tolist(), "low": low.tolist(),
             "high": high.tolist(), "V": floats(np.array(V))}
 
 
-def _slice(owner: Judged, base: Array, pair: tuple[int, ...], low: Array, high: Array, t: float) -> Array:
+def _slice(owner: Judged, base: Array, pair: tuple[int, ...], low: Array, high: Array, t: float, p: Array) -> Array:
     """[GRID, GRID] of V, the second coordinate down the rows."""
     x = np.tile(base, (GRID**2, 1))
     i, k = pair
     x[:, i], x[:, k] = (v.ravel() for v in np.meshgrid(*(np.linspace(low[c], high[c], GRID) for c in (i, k))))
-    return _values(owner, x, t).reshape(GRID, GRID)
+    return _values(owner, x, t, np.tile(p, (len(x), 1))).reshape(GRID, GRID)
 
 
 def _rollout_nodes(report: Results) -> int:

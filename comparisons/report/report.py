@@ -40,7 +40,8 @@ class Report(Results):
         return write_report(self, Path(folder), animation, draw)
 
     def __str__(self) -> str:
-        what = f"{self.ocp.system.name}, {count(len(self.x0), 'initial state')} {self.settings['initial states']}"
+        each = f", each at its own {', '.join(self.ocp.parameter_names)}" if self.ocp.np else ""
+        what = f"{self.ocp.system.name}, {count(len(self.x0), 'initial state')} {self.settings['initial states']}{each}"
         said = [textwrap.fill(sentence, WIDTH, subsequent_indent="  ") for sentence in self.verdict()]
         promised = [textwrap.fill(str(promise), WIDTH, subsequent_indent="  ") for promise in self.promises]
         return "\n".join([what, "", str(self.summary()), "", *NOTE, "", *self._disturbed(), *promised, *said])

@@ -55,7 +55,7 @@ class Judged:
     solves: Array  # [B], solves that `ms_first` went into: several starts, neighbours; 1 for a controller
     predicted: Array  # [B], the cost that the method itself expected, NaN where it has no opinion
     plan: Planned | None = None  # what a solver planned
-    value: Callable[[Array, float], Array] | None = None  # (x [B, nx], t) -> V [B], where it has one
+    value: Callable[[Array, float, Array], Array] | None = None  # (x [B, nx], t, p [B, np]) -> V [B], where it has one
     held: bool = False  # whether each control is held to the next node; else it is continuous
 
     @property
@@ -85,6 +85,7 @@ class Results:
     judged: tuple[Judged, ...]
     settings: Mapping[str, Any]
     seconds: float  # wall time of the comparison
+    p: Array | None = None  # [B, np], the parameters of each state; None where there are none
     audits: tuple[MethodAudit, ...] = ()  # of methods by name: models and integrators, values
     robustness: Robustness | None = None
     promises: tuple[Promise, ...] = ()  # one a method, where the states are independent draws
@@ -101,6 +102,25 @@ class Results:
     def summary(self) -> Summary:
         """One dict a method. Means are over the runs that did not fail; medians, percentiles and shares over all."""
         return Summary(self._summarize(m) for m in range(len(self.judged)))
+
+    @property
+    def parameters(self) -> Array:
+        """p [B, np], with no columns where the problem has none."""
+        return np.zeros((len(self.x0), 0)) if self.p is None else self.p
+
+    @property
+    def starts(self) -> Array:
+        """What tells the states apart, (x0, p) [B, nx + np]."""
+        return np.c_[self.x0, self.parameters]
+
+    @property
+    def start_names(self) -> tuple[str, ...]:
+        """Of the columns of `starts`."""
+        return (*self.ocp.system.state_names, *self.ocp.parameter_names)
+
+    def at(self, i: int) -> OCP:
+        """The problem of state i, its parameters folded in."""
+        return self.ocp.folded(self.parameters[i])
 
     @cached_property
     def cost(self) -> Array:
@@ -136,12 +156,13 @@ class Results:
 
     def _row(self, m: int, i: int) -> Row:
         j, s = self.judged[m], self.judged[m].simulation
-        return {"method": j.name, "state": i, "x0": self.x0[i].tolist(), "success": bool(s.success[i]),
+        p = {"p": self.parameters[i].tolist()} if self.ocp.np else {}
+        return {"method": j.name, "state": i, "x0": self.x0[i].tolist(), **p, "success": bool(s.success[i]),
                 "feasible": bool(self.feasible[m, i]), "message": s.message[i], "cost": float(s.cost[i]),
                 "gap": float(self.gap[m, i]), "best_cost": float(self.best[i]), "best_method": self.best_method[i],
                 "predicted_cost": float(j.predicted[i]), "running_cost": float(s.running_cost[i]),
                 "terminal_cost": float(s.terminal_cost[i]), "terminal_error": float(s.terminal_error[i]),
-                "x_end": s.x[i, -1].tolist(), "error": self.ocp.from_goal(s.x[i, -1]).tolist(),
+                "x_end": s.x[i, -1].tolist(), "error": self.ocp.from_goal(s.x[i, -1], self.parameters[i]).tolist(),
                 "control_magnitude": float(s.control_magnitude[i]),
                 "saturation": float(s.saturation[i]), "clearance": float(s.clearance[i]),
                 "ms_first": float(j.ms_first[i]), "solves": int(j.solves[i]),
@@ -240,12 +261,14 @@ def count(k: int, what: str) -> str:
 
 
 def flat_rows(report: Results) -> list[Row]:
-    """The rows with one column a coordinate: x0 as x0_NAME, x_end as end_NAME, x_end - x* as error_NAME."""
-    names = report.ocp.system.state_names
-    flat = []
+    """The rows with one column a coordinate: x0 as x0_NAME, p as p_NAME, x_end as end_NAME, x_end - x* as error_NAME.
+    """
+    names, flat = report.ocp.system.state_names, []
+    of = {"x0": ("x0", names), "p": ("p", report.ocp.parameter_names), "x_end": ("end", names),
+          "error": ("error", names)}
     for row in report.rows():
-        for key, short in (("x0", "x0"), ("x_end", "end"), ("error", "error")):
-            row |= {f"{short}_{name}": v for name, v in zip(names, row.pop(key), strict=True)}
+        for key, (short, columns) in of.items():
+            row |= {f"{short}_{name}": v for name, v in zip(columns, row.pop(key, ()), strict=True)}
         flat.append(row)
     return flat
 

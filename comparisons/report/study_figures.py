@@ -26,22 +26,23 @@ def study_figures() -> dict[str, Callable[[Results], Figure | None]]:
 
 
 def gap_map(report: Results) -> Figure | None:
-    """The gap of the explained method over the two coordinates that initial states differ most in."""
-    s, sd = report.ocp.system, report.x0.std(axis=0)
-    i, k = np.sort(np.argsort(-sd, kind="stable")[:2]) if s.nx > 1 else (0, 0)
+    """The gap of the explained method over the two coordinates, of x0 and p, that initial states differ most in."""
+    starts, names, unit = report.starts, report.start_names, report.ocp.unit
+    two, sd = len(names) > 1, starts.std(axis=0)
+    i, k = np.sort(np.argsort(-sd, kind="stable")[:2]) if two else (0, 0)
     m = explained_method(report)
     ok = report.feasible[m] & np.isfinite(report.gap[m])
     figure = Figure(figsize=(5.6, 4), layout="constrained")
     ax = figure.subplots()
-    y = report.x0[:, k] if s.nx > 1 else np.where(ok, np.maximum(report.gap[m], SMALL_GAP), np.nan)
+    y = starts[:, k] if two else np.where(ok, np.maximum(report.gap[m], SMALL_GAP), np.nan)
     if ok.any():
         shade = np.log10(np.maximum(report.gap[m, ok], SMALL_GAP))
-        points = ax.scatter(report.x0[ok, i], y[ok], c=shade, cmap="viridis_r", vmin=-2, vmax=2, s=14)
+        points = ax.scatter(starts[ok, i], y[ok], c=shade, cmap="viridis_r", vmin=-2, vmax=2, s=14)
         bar = figure.colorbar(points, ax=ax, ticks=[-2, -1, 0, 1, 2])
         bar.ax.set_yticklabels(["≤ 0.01 %", "0.1 %", "1 %", "10 %", "≥ 100 %"])
         bar.set_label(f"gap of {plain(report.judged[m].name)}")
-    ax.plot(report.x0[~ok, i], y[~ok], "x", color="k", markersize=5)
-    ax.set(xlabel=plain(s.unit(s.state_names[i])), ylabel=plain(s.unit(s.state_names[k])) if s.nx > 1 else "gap [%]")
+    ax.plot(starts[~ok, i], y[~ok], "x", color="k", markersize=5)
+    ax.set(xlabel=plain(unit(names[i])), ylabel=plain(unit(names[k])) if two else "gap [%]")
     return figure
 
 

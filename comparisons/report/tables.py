@@ -92,7 +92,8 @@ def errors(report: Results) -> Table:
     s = report.ocp.system
     body = []
     for j in report.judged:
-        error = np.abs(report.ocp.from_goal(j.simulation.x[:, -1]))[np.asarray(j.simulation.success, dtype=bool)]
+        away = report.ocp.from_goal(j.simulation.x[:, -1], report.parameters)
+        error = np.abs(away)[np.asarray(j.simulation.success, dtype=bool)]
         if len(error):
             body.append([j.name, *(f"{number(np.median(e))}, {number(np.max(e))}" for e in error.T)])
     return Table("Terminal error of each coordinate", ["method", *map(s.unit, s.state_names)], body,
@@ -109,9 +110,10 @@ def worst(report: Results) -> Table:
 
 
 def x0_text(report: Results, i: int) -> str:
-    """Like 'p 0.1, v -0.2', without the coordinates that are the same in all states."""
-    moves = (report.x0 != report.x0[0]).any(axis=0) | (len(report.x0) == 1)
-    named = zip(report.ocp.system.state_names, report.x0[i], moves, strict=True)
+    """Like 'p 0.1, v -0.2, mass 1.1', without what is the same in all states."""
+    starts = report.starts
+    moves = (starts != starts[0]).any(axis=0) | (len(starts) == 1)
+    named = zip(report.start_names, starts[i], moves, strict=True)
     return ", ".join(f"{name} {number(v)}" for name, v, moved in named if moved)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import os
 from pathlib import Path
 from typing import NoReturn
@@ -68,6 +69,27 @@ def known(text: str) -> dict[str, str | float]:
         except ValueError:
             found[name] = value
     return found
+
+
+def parameters(text: str) -> dict[str, float]:
+    """Parameters and their values, mass=1.2,goal=0.5."""
+    found: dict[str, float] = {}
+    for word in text.split(","):
+        name, equal, value = (part.strip() for part in word.partition("="))
+        number = _number(value)
+        if not (name and equal) or number is None or name in found:
+            raise argparse.ArgumentTypeError(f"{text!r}; expected different parameters with finite numbers, like "
+                                             "mass=1.2,goal=0.5")
+        found[name] = number
+    return found
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
 
 
 def words(text: str) -> tuple[str, ...]:

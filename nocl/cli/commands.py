@@ -97,9 +97,9 @@ def parser() -> argparse.ArgumentParser:
 
     command("list", _list, "the problems that come with nocl")
     sub = command("run", _run, "identify, train, export, solve by NMPC, compare and report, in one go")
-    _add(sub, "problem", "out", "seed", "n", "exact", "effort", "quick", "intervals", "methods")
+    _add(sub, "problem", "p", "out", "seed", "n", "exact", "effort", "quick", "intervals", "methods")
     sub = command("identify", _identify, "learn the dynamics, from the equations or from logged trajectories")
-    _add(sub, "problem", "out", "seed", "effort", "quick")
+    _add(sub, "problem", "p", "out", "seed", "effort", "quick")
     sub.add_argument("--data", type=Path, metavar="LOG", help="a .csv or .parquet file with columns t, states, "
                      "controls, and run: learn from it alone, test on a fifth of its runs")
     sub.add_argument("--known", type=arguments.known, metavar="A=B,C=D", help="with --data: derivatives that are "
@@ -107,9 +107,9 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--control-affine", action="store_true", help="with --data: xdot = a(x) + B(x) u")
     sub.add_argument("--hold-controls", action="store_true", help="with --data: an empty control is the last before it")
     sub = command("train", _train, "train a controller and a value function, on learned dynamics unless --exact")
-    _add(sub, "problem", "out", "seed", "exact", "effort", "quick")
+    _add(sub, "problem", "p", "out", "seed", "exact", "effort", "quick")
     sub = command("solve", _solve, "solve the problem from many initial states")
-    _add(sub, "problem", "out", "seed", "n", "intervals")
+    _add(sub, "problem", "p", "out", "seed", "n", "intervals")
     sub.add_argument("--solver", choices=registry.solvers(), default="nmpc", metavar="NAME",
                      help=f"default: nmpc; {_told_of(registry.solvers())}")
     sub.add_argument("--substeps", type=arguments.count, metavar="S", help="Runge-Kutta steps in each interval of a "
@@ -118,7 +118,7 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--workers", type=arguments.workers, default="auto", metavar="W",
                      help="processes or threads of the solver, auto, or a Dask scheduler's tcp://...; default: auto")
     sub = command("export", _export, "write a run's controller, value function and dynamics, proven equal to it")
-    _add(sub, "run")
+    _add(sub, "run", "p")
     sub.add_argument("--to", choices=arguments.FORMS, action="append",
                      help="default: casadi and c; may be given several times")
     sub.add_argument("--against", type=arguments.forms, metavar="A,B",
@@ -126,7 +126,7 @@ def parser() -> argparse.ArgumentParser:
                           "made here")
     sub.add_argument("--out", type=arguments.folder, metavar="DIR", help="default: RUN/export")
     sub = command("compare", _compare, "compare a run's controller with other methods, initial state by initial state")
-    _add(sub, "run", "n", "intervals", "methods")
+    _add(sub, "run", "p", "n", "intervals", "methods")
     sub.add_argument("--seed", type=arguments.seed, help=SEED + "; default: the seed of the run")
     sub.add_argument("--hold", type=arguments.holds, metavar="K",
                      help="judge feedback once more, held on K intervals; or K,L")
@@ -142,6 +142,9 @@ def _add(sub: argparse.ArgumentParser, *names: str) -> None:
     known: dict[str, tuple[str, dict[str, Any]]] = {
         "problem": ("problem", {"metavar": "NAME_OR_FILE", "help": "a problem's name, or a .py file with `ocp`"}),
         "run": ("run", {"type": arguments.folder, "metavar": "RUN", "help": "the folder of a run, like runs/cartpole"}),
+        "p": ("--p", {"type": arguments.parameters, "metavar": "A=1,B=2",
+                      "help": "the problem at these parameters, each by name, like mass=1.2,goal=0.5; without it they "
+                              "vary: a controller is for all of them, and each initial state has its own"}),
         "out": ("--out", {"type": arguments.folder, "metavar": "DIR", "help": "default: runs/NAME"}),
         "seed": ("--seed", {"type": arguments.seed, "default": 0, "help": SEED + "; default: 0"}),
         "n": ("--n", {"type": arguments.count, "default": 100, "help": "number of initial states; default: 100"}),
@@ -187,17 +190,32 @@ def _about(name: str) -> str:
 def _problem(args: argparse.Namespace) -> tuple[OCP, Path]:
     """The problem and the folder for its output; ValueError before anything is written."""
     ocp = load_ocp(args.problem)
-    ocp.refuse_parameters("the command line")
+    if args.p is not None:
+        ocp = ocp.at(args.p)
     name = Path(args.problem).stem if args.problem.endswith(".py") else args.problem
     out = args.out if args.out is not None else Path("runs") / name
     arguments.check_out(out)
     return ocp, out
 
 
+def _check_learnable(ocp: OCP) -> None:
+    """ValueError where dynamics are to be learned of a system with parameters or time."""
+    s = ocp.system
+    if s.np:
+        raise ValueError(f"learned dynamics are not implemented for parameters, and the system {s.name!r} has "
+                         f"{', '.join(s.parameter_names)}; expected one without: give {registry.asked(ocp)}, or train "
+                         "on the equations, --exact")
+    if s.uses_time:
+        raise ValueError(f"learned dynamics are not implemented for the time t, which the system {s.name!r} holds; "
+                         "expected one without: train on the equations, --exact")
+
+
 def _run(args: argparse.Namespace) -> None:
     from nocl.cli.run_folder import RunFolder  # torch
 
     ocp, out = _problem(args)
+    if not args.exact:
+        _check_learnable(ocp)
     stages = RunFolder(ocp, out, args.seed, args.effort)
     stages.check(exact=args.exact)
     _refuse(ocp, args.methods, registry.Options(args.intervals, args.seed))
@@ -223,6 +241,7 @@ def _identify(args: argparse.Namespace) -> None:
     from nocl.cli.run_folder import RunFolder  # torch
 
     ocp, out = _problem(args)
+    _check_learnable(ocp)
     stages = RunFolder(ocp, out, args.seed, args.effort)
     stages.check(exact=False)
     if args.data is None and (args.known or args.control_affine or args.hold_controls):
@@ -238,6 +257,8 @@ def _train(args: argparse.Namespace) -> None:
     from nocl.cli.run_folder import RunFolder  # torch
 
     ocp, out = _problem(args)
+    if not args.exact:
+        _check_learnable(ocp)
     stages = RunFolder(ocp, out, args.seed, args.effort)
     stages.check(exact=args.exact)
     with alone(out):
@@ -250,14 +271,14 @@ def _solve(args: argparse.Namespace) -> None:
     ocp, out = _problem(args)
     with alone(out / "solutions"):
         options = registry.Options(args.intervals, args.seed, args.substeps)
-        solve(ocp, out / "solutions", args.solver, args.n, options, args.workers)
+        solve(ocp, out / "solutions", args.solver, args.n, options, args.workers, args.p)
 
 
 def _export(args: argparse.Namespace) -> None:
     from nocl.cli.run_folder import RunFolder, load_run  # torch
 
     run = args.run
-    cnd = load_run(run)
+    cnd = load_run(run, args.p)
     out = args.out if args.out is not None else run / "export"
     arguments.check_out(out)
     RunFolder(cnd.ocp, run, 0).export(cnd, out, tuple(dict.fromkeys(args.to or ("casadi", "c"))), args.against)
@@ -267,9 +288,12 @@ def _compare(args: argparse.Namespace) -> None:
     from nocl.cli.run_folder import RunFolder, beside, load_run  # torch
 
     run = args.run
-    cnd = load_run(run)
+    cnd = load_run(run, args.p)
     out = args.out if args.out is not None else run / "report"
     arguments.check_out(out)
+    if args.robust and cnd.ocp.np:
+        raise ValueError(f"--robust is not implemented for the parameter(s) {', '.join(cnd.ocp.parameter_names)}; "
+                         f"expected a problem without: give {registry.asked(cnd.ocp)}")
     seed = int(cnd.card.get("seed", 0)) if args.seed is None else args.seed
     _refuse(cnd.ocp, args.methods, registry.Options(args.intervals, seed))
     with alone(beside(out, run)):  # where outcomes so far are kept

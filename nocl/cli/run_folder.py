@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from inspect import signature
@@ -20,8 +20,10 @@ from typing import Any
 import numpy as np
 
 from nocl import __version__
+from nocl.comparisons.at_each import Laws, at_each, is_plan
 from nocl.comparisons.disturbances import mass_variants
-from nocl.comparisons.methods import is_plan, own_rate
+from nocl.comparisons.judging import Disturbance, Judging
+from nocl.comparisons.methods import Solving, Starts, own_rate, runs_of
 from nocl.comparisons.report.results import count
 from nocl.comparisons.studies import study
 from nocl.data import TINY
@@ -34,7 +36,6 @@ from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.settings import TrainSettings
 from nocl.solvers.cnd.training import train
 from nocl.support import store
-from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint, json_text, sha256
 from nocl.sysid.identification import LearnedDynamics, LogSettings, Settings, identify
 from nocl.sysid.logs.log import Log
@@ -140,8 +141,9 @@ class RunFolder:
         """Study the methods on n fresh initial states, save the report and print its summary and verdict."""
         entries, options = [registry.METHODS[name] for name in methods], registry.Options(intervals, self.seed)
         titles = ", ".join(entry.title for entry in entries)
-        say(f"comparing {titles} on {n} initial states, drawn with seed {fresh_seed(self.seed)}, on the exact dynamics")
-        chosen = {entry.title: entry.build(self.ocp, options) if entry.make else cnd for entry in entries}
+        say(f"comparing {titles} on {n} initial states, drawn with seed {fresh_seed(self.seed)}{own_p(self.ocp)}, on "
+            "the exact dynamics")
+        chosen = {entry.title: built(self.ocp, entry, options) if entry.make else cnd for entry in entries}
         model = self._dynamics_there() if cnd.card.get("dynamics") == "learned" else None
         checkpoint = self._checkpoint(
             beside(out, self.folder), methods=list(methods), n=n, intervals=intervals, hold=str(hold), robust=robust,
@@ -221,45 +223,63 @@ def fresh_states(ocp: OCP, n: int, seed: int) -> np.ndarray[Any, np.dtype[np.flo
     return ocp.initial_states.sample(n, fresh_seed(seed))
 
 
-def load_run(folder: Path) -> CND:
-    """The controller of a run's folder, or of a folder that CND.save wrote."""
+def own_p(ocp: OCP) -> str:
+    """That each state has its own parameters, in words; "" where there are none."""
+    return f", each at its own {', '.join(ocp.parameter_names)}" if ocp.np else ""
+
+
+def built(ocp: OCP, entry: registry.Method, options: registry.Options) -> Any:
+    """A method of the registry for this problem, made anew at each p where it knows no parameters."""
+    entry.check_parameters(ocp)
+    if entry.p == "rows":
+        return entry.build(ocp, options)
+    return at_each(ocp, lambda one: entry.build(one, options))
+
+
+def load_run(folder: Path, p: Mapping[str, float] | None = None) -> CND:
+    """The controller of a run's folder, or of a folder that CND.save wrote; with p at these parameters."""
     if not folder.is_dir():
         raise ValueError(f"there is no folder {folder}; expected one that `nocl run` or `nocl train` made")
-    return CND.load(folder / "cnd" if (folder / "cnd").is_dir() else folder)
+    cnd = CND.load(folder / "cnd" if (folder / "cnd").is_dir() else folder)
+    return cnd if p is None else cnd.at(p)
 
 
-def solve(ocp: OCP, out: Path, name: str, n: int, options: registry.Options, workers: int | str = "auto") -> None:
+def solve(ocp: OCP, out: Path, name: str, n: int, options: registry.Options, workers: int | str = "auto",
+          at: Mapping[str, float] | None = None) -> None:
     """Solve n initial states by one method, and write OUT/NAME.npz (arrays), .json (messages) and a line of summary.
 
+    On a problem with parameters each state has its own p; `at` are those that a problem without was made at.
     Feedback is simulated; plans are judged, run in open loop on the exact f, the first JUDGED of them. What is solved
     is kept in OUT/checkpoint until all is: the same call goes on from there. ValueError, at the end, where nothing was
     solved.
     """
-    seed, x0 = options.seed, fresh_states(ocp, n, options.seed)
+    seed, starts = options.seed, Starts.drawn(ocp, n, fresh_seed(options.seed))
     start, checkpoint = time.perf_counter(), out / "checkpoint" / _solve_key(ocp, name, n, options)
-    method = registry.METHODS[name].build(ocp, options)
+    method = built(ocp, registry.METHODS[name], options)
     planned = is_plan(method)
-    s, arrays, facts = _solved(method, x0, workers, checkpoint) if planned else _simulated(ocp, method, x0)
-    judged = _judged(ocp, x0, arrays) if planned else {}
-    path = _write_arrays(out / f"{name}.npz", {"x0": x0, **arrays, **judged})
+    s, arrays, facts = _solved(ocp, method, starts, workers, checkpoint) if planned else _simulated(ocp, method, starts)
+    judged = _judged(ocp, starts, arrays) if planned else {}
+    with_p = {"p": starts.p} if ocp.np else {}
+    facts |= {"parameters": list(ocp.parameter_names)} if ocp.np else {"p": dict(at)} if at else {}
+    path = _write_arrays(out / f"{name}.npz", {"x0": starts.x, **with_p, **arrays, **judged})
     store.write_json(out / f"{name}.json", {"solver": name, "n": n, "seed": fresh_seed(seed), **facts,
                                             "message": list(s.message)})
     _forget(checkpoint)
     ok = arrays["success"]
     mean = f", mean cost {arrays['cost'][ok].mean():.4g}" if ok.any() else ""
     say(f"{name}: {ok.sum()} of {n} {'solved' if planned else 'simulated'}{mean}, {time.perf_counter() - start:.1f} s; "
-        f"drawn with seed {fresh_seed(seed)}\n{_verdict(ocp, arrays, judged, s.message)}{path}")
+        f"drawn with seed {fresh_seed(seed)}{own_p(ocp)}\n{_verdict(ocp, arrays, judged, s.message)}{path}")
     if not ok.any():
         raise ValueError(f"{name} {'solved' if planned else 'simulated'} none of {count(n, 'initial state')}; of the "
                          f"first: {s.message[0]}")
 
 
-def _judged(ocp: OCP, x0: Array, arrays: dict[str, Any]) -> dict[str, Any]:
+def _judged(ocp: OCP, starts: Starts, arrays: dict[str, Any]) -> dict[str, Any]:
     """Cost and clearance of plans on the exact f, of the first JUDGED that were solved; NaN of the others."""
-    rows, n = np.flatnonzero(arrays["success"])[:JUDGED], len(x0)
+    rows, n = np.flatnonzero(arrays["success"])[:JUDGED], len(starts)
     cost, clearance = np.full(n, np.nan), np.full(n, np.nan)
     if len(rows):
-        s = simulate(ocp, arrays["u"][rows], x0[rows])
+        s = simulate(ocp, arrays["u"][rows], starts.x[rows], p=starts.p[rows])
         cost[rows], clearance[rows] = s.cost, s.clearance
     return {"judged_cost": cost, "judged_clearance": clearance}
 
@@ -284,19 +304,27 @@ def _verdict(ocp: OCP, arrays: dict[str, Any], judged: dict[str, Any], message: 
     return "".join(f"{line}\n" for line in said)
 
 
-def _simulated(ocp: OCP, method: Any, x0: Array) -> tuple[Any, dict[str, Any], dict[str, Any]]:
+def _simulated(ocp: OCP, method: Any, starts: Starts) -> tuple[Any, dict[str, Any], dict[str, Any]]:
     """(simulation, its arrays, nothing more) of feedback, at its own rate."""
-    s = simulate(ocp, method, x0, hold=own_rate(ocp, method))
+    if isinstance(method, Laws):
+        (run,) = runs_of(ocp, {"law": method}, starts, (None,), Solving())
+        job = Judging(ocp, starts, [run], Disturbance(), [0.0], timed=False)
+        s = job.judge(run, np.arange(len(starts)), 0.0).simulation
+    else:
+        s = simulate(ocp, method, starts.x, hold=own_rate(ocp, method), p=starts.p)
     return s, {"t": s.t, "x": s.x, "u": s.u, "cost": s.cost, "success": s.success}, {}
 
 
-def _solved(method: Any, x0: Array, workers: int | str,
+def _solved(ocp: OCP, method: Any, starts: Starts, workers: int | str,
             checkpoint: Path) -> tuple[Any, dict[str, Any], dict[str, Any]]:
     """(solution, its arrays, how sure each optimum is)."""
-    given, takes = {"workers": workers, "out": checkpoint}, signature(method.solve).parameters
-    s = method.solve(x0, **{key: value for key, value in given.items() if key in takes})
+    given: dict[str, Any] = {"workers": workers, "out": checkpoint, "p": starts.p if ocp.np else None}
+    takes = signature(method.solve).parameters
+    s = method.solve(starts.x, **{key: value for key, value in given.items() if key in takes})
     arrays = {"t": s.t, "x": s.x, "u": s.u, "cost": s.cost, "success": s.success, "costate": s.costate,
-              "clearance": np.full(len(x0), np.nan) if s.clearance is None else s.clearance}
+              "clearance": np.full(len(s), np.nan) if s.clearance is None else s.clearance}
+    if s.V_p is not None:
+        arrays["V_p"] = s.V_p
     return s, arrays, {"starts": s.starts, "hits": s.hits, "optima": [len(o) for o in s.optima]}
 
 

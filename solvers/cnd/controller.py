@@ -78,12 +78,13 @@ class CND:
 
     def at(self, p: Any) -> CND:
         """The controller u(x, t) at given parameters, [np] or by name, folded in as constants, of `ocp.at(p)`."""
-        value, ocp = self.ocp.parameters_of(p, 1, "CND.at")[0], self.ocp.at(p)
+        value = self.ocp.parameters_of(p, 1, "CND.at")[0]
         if not self.ocp.np:
             return self
         policy = folded(self._at_rates or self.policy, p=value)
         V = None if self.value_net is None else folded(self.value_net, p=value)
-        return CND(ocp, policy, V, self.card | {"p": dict(zip(self.ocp.parameter_names, value.tolist(), strict=True))})
+        card = self.card | {"p": dict(zip(self.ocp.parameter_names, value.tolist(), strict=True))}
+        return CND(self.ocp.folded(value), policy, V, card)
 
     @property
     def continuous_angles(self) -> tuple[str, ...]:

@@ -100,6 +100,10 @@ class GlobalDDP:
     def substeps(self) -> int:
         return self.ddp.substeps
 
+    @property
+    def ocp(self) -> OCP:
+        return self.ddp.ocp
+
     def solve(self, x0: ArrayLike, workers: int | str = "auto", out: str | os.PathLike[str] | None = None,
               progress: bool | None = None, p: Any = None) -> Solution:
         return solve_globally(self.ddp, x0, p=p, starts=self.starts, seed=self.seed, workers=workers, out=out,

@@ -22,7 +22,9 @@ function bytes(text) {
 }
 const floats = (text) => new Float32Array(bytes(text).buffer);
 const X0 = floats(D.x0), GAP = floats(D.gap);
-const x0 = (i, k) => X0[i * nx + k];
+const PARAMETERS = D.parameters || [], np = PARAMETERS.length, P = np ? floats(D.p) : null, GOALS = D.goals ? floats(D.goals) : null;
+const x0 = (i, k) => k < nx ? X0[i * nx + k] : P[i * np + k - nx - nu];  // parameters count on after the controls
+const goal = (k) => GOALS ? GOALS[state * (nx + nu) + k] : D.goal[k];  // of the state that is shown
 const gap = (m, i) => GAP[m * B + i];
 const NUMBERS = D.methods.map((method) => floats(method.numbers));
 const column = (name) => D.numbers.indexOf(name);
@@ -52,7 +54,7 @@ function text(value) {
 const percent = (value) => Number.isFinite(value) ? text(Number(Math.max(value, 0).toPrecision(3))) + " %" : "failed";
 const safe = (value) => String(value).replace(/[&<>"]/g, (c) => ({"&": "&amp;", "<": "&lt;", ">": "&gt;", '"': "&quot;"})[c]);
 const MNAMES = D.methods.map((method) => safe(method.name));  // plotly reads names as a little HTML
-const LABELS = D.labels.map(safe);
+const LABELS = D.labels.concat(D.plabels || []).map(safe);
 
 // ---- plots --------------------------------------------------------------------------------------------------------
 function axis(extra) {
@@ -131,7 +133,8 @@ function drawOutcome() {
     return `<table><thead><tr><th>audit of ${safe(audit.method)}</th>${audit.keys.map((key) => `<th>${safe(key)}</th>`).join("")}</tr></thead>` +
            `<tbody><tr><td></td>${values.map((v) => `<td>${text(v)}</td>`).join("")}</tr></tbody></table>`;
   }).join("");
-  const start = D.states.map((name, k) => `${name} ${text(x0(state, k))}`).join(", ");
+  const start = [...D.states.map((name, k) => [name, k]), ...PARAMETERS.map((name, k) => [name, nx + nu + k])]
+    .map(([name, k]) => `${name} ${text(x0(state, k))}`).join(", ");
   $("which").textContent = `State ${state}: ${start}` + (D.best[state] >= 0 ? `. Best known by ${D.methods[D.best[state]].name}` : "");
   $("number").value = state;
 }
@@ -150,7 +153,7 @@ function drawRuns() {
                             showarrow: false, font: {size: 12, color: css("--quiet")}});
     const across = (y, dash) => extra.shapes.push({type: "line", xref: "x" + id, yref: "y" + id, x0: 0, x1: D.horizon, y0: y, y1: y,
                                                    layer: "below", line: {color: css("--quiet"), width: 1, dash}});
-    across(D.goal[k], "dot");
+    across(goal(k), "dot");
     const values = kept.flatMap((r) => r ? r[k].filter((v) => v !== null) : []);
     if (k >= nx && values.length) {
       const low = D.lbu[k - nx], high = D.ubu[k - nx], room = 0.02 * (high - low);
@@ -211,7 +214,7 @@ function drawPhase() {
                             marker: {symbol: "circle-open", size: 11, color: css("--text"), line: {width: 2}}});
     first = false;
   });
-  traces.push({type: "scatter", mode: "markers", name: "goal", x: [D.goal[i]], y: [D.goal[k]], showlegend: false, hoverinfo: "skip",
+  traces.push({type: "scatter", mode: "markers", name: "goal", x: [goal(i)], y: [goal(k)], showlegend: false, hoverinfo: "skip",
                marker: {symbol: "star", size: 12, color: css("--text")}});
   const even = D.obstacles.some((o) => [o.i, o.k].includes(i) && [o.i, o.k].includes(k)) && i !== k ? {scaleanchor: "x", constrain: "domain"} : {};
   draw("phase", traces, {xaxis: axis({title: {text: LABELS[i]}, constrain: "domain"}), yaxis: axis({title: {text: LABELS[k]}, ...even})});
@@ -278,6 +281,7 @@ function drawSlice() {
   traces.push({type: "scatter", mode: "markers", x: [D.goal[i]], y: [D.goal[k]], showlegend: false, hoverinfo: "skip", marker: {symbol: "star", size: 12, color: css("--text")}});
   const rest = D.states.map((name, c) => [name, S.base[q][c], c]).filter(([, , c]) => c !== i && c !== k).map(([name, v]) => `${name} = ${text(v)}`).join(", ");
   $("slicenote").textContent = `V(x, t) of ${S.method} at t = ${text(t)}` + (rest ? `, with ${rest} (the median of its runs then)` : "") +
+    (np ? `, at the nominal ${PARAMETERS.map((name, c) => `${name} = ${text(D.nominal[c])}`).join(", ")}` : "") +
     `. On top: ${some.length} runs of each method; dots: where they are at that time. Where others than these two coordinates matter, a run does not lie in the slice.`;
   draw("slice", traces, {xaxis: axis({title: {text: LABELS[i]}, range: [S.low[i], S.high[i]]}), yaxis: axis({title: {text: LABELS[k]}, range: [S.low[k], S.high[k]]})});
 }
@@ -344,8 +348,9 @@ const coordinates = D.states.map((name, k) => [String(k), D.labels[k]]);
 const order = spread(X0), plane = D.plane.filter((k) => k < nx && order.indexOf(k) >= 0);
 const moving = order.slice(0, 2);
 const axes = plane.length === 2 && plane.every((k) => moving.includes(k)) ? plane : moving;
-fill("across", coordinates, axes[0]);
-fill("up", [["gap", "gap"], ...coordinates], axes.length > 1 ? axes[1] : "gap");
+const starting = coordinates.concat(PARAMETERS.map((_, k) => [String(nx + nu + k), D.plabels[k]]));
+fill("across", starting, axes[0]);
+fill("up", [["gap", "gap"], ...starting], axes.length > 1 ? axes[1] : "gap");
 fill("colour", D.methods.map((method, m) => [String(m), "gap of " + method.name]), D.explained);
 fill("phasex", D.labels.map((label, k) => [String(k), label]), D.plane[0]);
 fill("phasey", D.labels.map((label, k) => [String(k), label]), D.plane[1]);

@@ -1,0 +1,87 @@
+"""Methods that know no parameters, on a problem that has some: made anew at each p, for the problem at that p.
+
+LQR about each goal, or a planner for each obstacle: `at_each(ocp, LQR)` is a method that compare runs beside those that
+take p themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import casadi as ca
+import numpy as np
+
+from nocl.data import Solution
+from nocl.judge import answer_of, policy_function
+from nocl.ocp import OCP
+from nocl.support import checks
+from nocl.support.checks import Array
+
+Make = Callable[[OCP], Any]  # a problem without parameters -> feedback or a solver
+
+
+def at_each(ocp: OCP, make: Make) -> Any:
+    """The method that is make(ocp.at(p)) at each p; make(ocp) itself where the problem has no parameters.
+
+    make : like LQR, or lambda one: RRTStar(one, seed=0); what it returns is kept, one for each p that is met
+
+    Raises ValueError for what is no function, and whatever `make` raises at the nominal parameters.
+    """
+    checks.problem(ocp, "at_each")
+    if not callable(make):
+        raise ValueError(f"at_each: make is {checks.shown(make)}; expected a function of a problem without parameters, "
+                         "like nocl.solvers.LQR")
+    if not ocp.np:
+        return make(ocp)
+    first = make(ocp.folded(ocp.nominal))
+    if is_plan(first):
+        return Plans(ocp, make, getattr(first, "settled", first))
+    return Laws(ocp, make, policy_function(ocp.folded(ocp.nominal), first) is not None)
+
+
+def is_plan(method: Any) -> bool:
+    """Whether it is run open loop."""
+    return isinstance(method, Solution) or \
+        (hasattr(method, "solve") and not hasattr(method, "to_casadi") and not isinstance(method, ca.Function))
+
+
+class _Each:
+    def __init__(self, ocp: OCP, make: Make) -> None:
+        self.ocp, self.make = ocp, make
+        self.made: dict[bytes, Any] = {}  # by p's bytes
+
+    def at(self, p: Array) -> Any:
+        """The method at parameters p [np]."""
+        key = np.ascontiguousarray(p).tobytes()
+        if key not in self.made:
+            self.made[key] = self.make(self.ocp.folded(p))
+        return self.made[key]
+
+
+class Laws(_Each):
+    """Feedback of each p: rows x [B, nx], p [B, np] -> u [B, nu]. The judge runs each as what it is, continuous too."""
+
+    def __init__(self, ocp: OCP, make: Make, continuous: bool) -> None:
+        super().__init__(ocp, make)
+        self.continuous = continuous
+
+    def __call__(self, x: Array, t: float, p: Array) -> Array:
+        return np.vstack([np.atleast_2d(answer_of(self.at(one), x[i:i + 1], t)) for i, one in enumerate(p)])
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Laws, (self.ocp, self.make, self.continuous)  # what was made is made again
+
+
+class Plans(_Each):
+    """A solver of each p."""
+
+    def __init__(self, ocp: OCP, make: Make, settled: Any) -> None:
+        super().__init__(ocp, make)
+        self.settled = settled  # the solver at the nominal parameters: what is told of all of them
+
+    def solve(self, x0: Array, p: Any = None) -> Solution:
+        """The solutions from x0 [B, nx], each at its own row of p."""
+        rows = self.ocp.parameters_of(p, len(x0), "at_each")
+        parts = [self.at(one).solve(x0[i:i + 1]) for i, one in enumerate(rows)]
+        return Solution.join(parts)
