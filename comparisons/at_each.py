@@ -49,13 +49,14 @@ def is_plan(method: Any) -> bool:
 class _Each:
     def __init__(self, ocp: OCP, make: Make) -> None:
         self.ocp, self.make = ocp, make
-        self.made: dict[bytes, Any] = {}  # by p's bytes
+        self.made: dict[bytes, tuple[OCP, Any]] = {}  # by p's bytes
 
-    def at(self, p: Array) -> Any:
-        """The method at parameters p [np]."""
+    def at(self, p: Array) -> tuple[OCP, Any]:
+        """The problem at parameters p [np], and the method for it."""
         key = np.ascontiguousarray(p).tobytes()
         if key not in self.made:
-            self.made[key] = self.make(self.ocp.folded(p))
+            one = self.ocp.folded(p)
+            self.made[key] = one, self.make(one)
         return self.made[key]
 
 
@@ -67,7 +68,7 @@ class Laws(_Each):
         self.continuous = continuous
 
     def __call__(self, x: Array, t: float, p: Array) -> Array:
-        return np.vstack([np.atleast_2d(answer_of(self.at(one), x[i:i + 1], t)) for i, one in enumerate(p)])
+        return np.vstack([np.atleast_2d(answer_of(self.at(one)[1], x[i:i + 1], t)) for i, one in enumerate(p)])
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Laws, (self.ocp, self.make, self.continuous)  # what was made is made again
@@ -83,5 +84,5 @@ class Plans(_Each):
     def solve(self, x0: Array, p: Any = None) -> Solution:
         """The solutions from x0 [B, nx], each at its own row of p."""
         rows = self.ocp.parameters_of(p, len(x0), "at_each")
-        parts = [self.at(one).solve(x0[i:i + 1]) for i, one in enumerate(rows)]
+        parts = [self.at(one)[1].solve(x0[i:i + 1]) for i, one in enumerate(rows)]
         return Solution.join(parts)

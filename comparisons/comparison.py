@@ -104,8 +104,7 @@ def _value(ocp: OCP, method: Any, predicted: Array) -> Any:
 def _predicted(ocp: OCP, method: Any, starts: Starts) -> Array:
     """The cost that the method itself expects, V(x0, 0[, p]), where it has a value function; else NaN."""
     if isinstance(method, Laws):
-        alone = [Starts(starts.x[[i]], np.zeros((1, 0))) for i in range(len(starts))]
-        return np.concatenate([_predicted(ocp, method.at(p), one) for one, p in zip(alone, starts.p, strict=True)])
+        return np.concatenate([_predicted_at(method, x, p) for x, p in zip(starts.x, starts.p, strict=True)])
     if hasattr(method, "value"):
         try:
             values = np.asarray(method.value(starts.x, 0.0, *starts.given(ocp, method)), dtype=np.float64).ravel()
@@ -114,3 +113,11 @@ def _predicted(ocp: OCP, method: Any, starts: Starts) -> Array:
         if len(values) == len(starts):
             return values
     return np.full(len(starts), np.nan)
+
+
+def _predicted_at(laws: Laws, x0: Array, p: Array) -> Array:
+    try:
+        ocp, law = laws.at(p)
+    except Exception:  # the judge's row says what it raised
+        return np.full(1, np.nan)
+    return _predicted(ocp, law, Starts(x0[None], np.zeros((1, 0))))

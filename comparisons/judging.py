@@ -123,15 +123,14 @@ class Judging:
 
     def _at(self, run: MethodRun, laws: Laws, row: int, delay: float) -> Judgement:
         """One state of a law that is made for its p, judged on the problem at that p."""
-        p = self.starts.p[row]
-        ocp, alone = self.ocp.folded(p), Starts(self.starts.x[[row]], np.zeros((1, 0)))
         try:
-            law = laws.at(p)
+            ocp, law = laws.at(self.starts.p[row])
         except Exception as error:  # whatever it raises at this p
             return _unknown(failed(self.ocp, [said(error)], self._nodes(run.hold or 80)))
-        controller = policy_function(ocp, law) or law
-        job = replace(self, ocp=ocp, starts=alone)
-        return job.judge(replace(run, controller=controller), np.zeros(1, dtype=np.int64), delay)
+        policy = policy_function(ocp, law)
+        job = replace(self, ocp=ocp, starts=Starts(self.starts.x[[row]], np.zeros((1, 0))))
+        one = replace(run, controller=law if policy is None else policy)
+        return job.judge(one, np.zeros(1, dtype=np.int64), delay)
 
     def _nodes(self, K: int) -> Array:
         return np.linspace(0.0, self.ocp.horizon, K + 1)

@@ -261,8 +261,9 @@ def _off_grid(ocp: OCP, solution: Solution) -> str:
 def solve(ocp: OCP, solver: Any, name: str, x0: Starts, solving: Solving) -> list[Solution | str]:
     """The Solution of all states at once; where that raises, state by state, what was raised instead."""
     out = None if solving.out is None else solving.out / "solves" / folder_name(name)
-    p = x0.p if takes_p(ocp, solver) else None
-    given = {"workers": solving.workers, "out": out, "progress": solving.progress, "p": p}
+    given: dict[str, Any] = {"workers": solving.workers, "out": out, "progress": solving.progress}
+    if takes_p(ocp, solver):
+        given["p"] = x0.p
     takes = inspect.signature(solver.solve).parameters
     options = {key: value for key, value in given.items() if key in takes}
     try:
