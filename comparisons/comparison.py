@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ def compare(ocp: OCP, methods: Mapping[str, Any], n: int = 100, x0: ArrayLike | 
 
     Parameters
     ----------
-    p : parameters, [np] for all states, [B, np], or by name (OCP.parameters_of); drawn where states are
+    p : parameters, [np] for all states, [B, np], or by name (OCP.parameters_of); default: drawn, where states are
     hold : rates of feedback: None, continuous; K, continuous and once more held on K intervals, as the method
         "NAME (K holds)"; a list of these, [None, 80, 400], each
     workers : 1, a number of processes, or "auto": processes where the measured cost of the first parts says that they
@@ -96,9 +97,11 @@ def _judged(ocp: OCP, run: MethodRun, judgement: Judgement, starts: Starts) -> J
 
 def _value(ocp: OCP, method: Any, predicted: Array) -> Any:
     """The method's own value function, which the report draws slices of, where it answers."""
-    if not (hasattr(method, "value") and np.isfinite(predicted).any()):
-        return None
-    return lambda x, t, p: method.value(x, t, *Starts(x, p).given(ocp, method))
+    return partial(_value_at, ocp, method) if hasattr(method, "value") and np.isfinite(predicted).any() else None
+
+
+def _value_at(ocp: OCP, method: Any, x: Array, t: float, p: Array) -> Any:
+    return method.value(x, t, *Starts(x, p).given(ocp, method))
 
 
 def _predicted(ocp: OCP, method: Any, starts: Starts) -> Array:
