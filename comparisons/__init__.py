@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from nocl.support.lazy import hand_on
 
-_LAZY = {"at_each": "nocl.comparisons.at_each", "compare": "nocl.comparisons.comparison",
+_LAZY = {"at_each": "nocl.comparisons.each", "compare": "nocl.comparisons.comparison",
          "Report": "nocl.comparisons.report.report",
          "robustness": "nocl.comparisons.disturbances", "study": "nocl.comparisons.studies"}
 __all__ = list(_LAZY)

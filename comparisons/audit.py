@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from nocl.comparisons.at_each import Laws
+from nocl.comparisons.each import Laws
 from nocl.comparisons.methods import Starts
 from nocl.comparisons.report.findings import MethodAudit, Rollouts, ValueAudit, per_cent
 from nocl.comparisons.report.report import Report

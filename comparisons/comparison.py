@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nocl.comparisons.at_each import Laws
+from nocl.comparisons.each import Laws
 from nocl.comparisons.judging import Disturbance, Judgement, Judging, judge
 from nocl.comparisons.methods import MethodRun, Solving, Starts, checked, is_count, rates_of, runs_of
 from nocl.comparisons.report.report import Report
@@ -120,7 +120,7 @@ def _predicted(ocp: OCP, method: Any, starts: Starts) -> Array:
 
 def _predicted_at(laws: Laws, x0: Array, p: Array) -> Array:
     try:
-        ocp, law = laws.at(p)
+        ocp, law, _ = laws.at(p)
     except Exception:  # the judge's row says what it raised
         return np.full(1, np.nan)
     return _predicted(ocp, law, Starts(x0[None], np.zeros((1, 0))))

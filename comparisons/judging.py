@@ -15,9 +15,9 @@ import cloudpickle
 import numpy as np
 from numpy.typing import NDArray
 
-from nocl.comparisons.at_each import Laws
+from nocl.comparisons.each import Laws
 from nocl.comparisons.methods import STAGES, MethodRun, Starts, said, substeps_of
-from nocl.judge import Simulation, policy_function, simulate
+from nocl.judge import Simulation, simulate
 from nocl.ocp import OCP
 from nocl.solvers.nmpc.loop import Loop
 from nocl.support.checks import Array
@@ -124,13 +124,11 @@ class Judging:
     def _at(self, run: MethodRun, laws: Laws, row: int, delay: float) -> Judgement:
         """One state of a law that is made for its p, judged on the problem at that p."""
         try:
-            ocp, law = laws.at(self.starts.p[row])
+            ocp, _, controller = laws.at(self.starts.p[row])
         except Exception as error:  # whatever it raises at this p
             return _unknown(failed(self.ocp, [said(error)], self._nodes(run.hold or 80)))
-        policy = policy_function(ocp, law)
         job = replace(self, ocp=ocp, starts=Starts(self.starts.x[[row]], np.zeros((1, 0))))
-        one = replace(run, controller=law if policy is None else policy)
-        return job.judge(one, np.zeros(1, dtype=np.int64), delay)
+        return job.judge(replace(run, controller=controller), np.zeros(1, dtype=np.int64), delay)
 
     def _nodes(self, K: int) -> Array:
         return np.linspace(0.0, self.ocp.horizon, K + 1)

@@ -21,7 +21,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from nocl.comparisons.at_each import Laws, is_plan
+from nocl.comparisons.each import Laws, is_plan
 from nocl.comparisons.report.results import Planned, count
 from nocl.data import Solution
 from nocl.judge import check_made_for, check_takes_p, policy_function, takes_p

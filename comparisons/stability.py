@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from nocl.comparisons.at_each import Laws
+from nocl.comparisons.each import Laws
 from nocl.comparisons.methods import Starts
 from nocl.comparisons.report.findings import Stability
 from nocl.comparisons.report.report import Report

@@ -12,7 +12,7 @@ import nocl
 from nocl.cli.commands import main, parser
 from nocl.cli.reproduce import TABLES, table_of
 from nocl.comparisons import compare
-from nocl.comparisons.at_each import is_plan
+from nocl.comparisons.each import is_plan
 from nocl.solvers import NMPC, registry
 from nocl.solvers.registry import METHODS, Method, Options
 from nocl.systems import quadrotor

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 from nocl import __version__
-from nocl.comparisons.at_each import Laws, at_each, is_plan
 from nocl.comparisons.disturbances import mass_variants
+from nocl.comparisons.each import Laws, at_each, is_plan
 from nocl.comparisons.judging import Disturbance, Judging
 from nocl.comparisons.methods import Solving, Starts, own_rate, runs_of
 from nocl.comparisons.report.results import count

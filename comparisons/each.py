@@ -49,14 +49,16 @@ def is_plan(method: Any) -> bool:
 class _Each:
     def __init__(self, ocp: OCP, make: Make) -> None:
         self.ocp, self.make = ocp, make
-        self.made: dict[bytes, tuple[OCP, Any]] = {}  # by p's bytes
+        self.made: dict[bytes, tuple[OCP, Any, Any]] = {}  # by p's bytes
 
-    def at(self, p: Array) -> tuple[OCP, Any]:
-        """The problem at parameters p [np], and the method for it."""
+    def at(self, p: Array) -> tuple[OCP, Any, Any]:
+        """(the problem at parameters p [np], the method for it, its policy in CasADi or else itself)."""
         key = np.ascontiguousarray(p).tobytes()
         if key not in self.made:
             one = self.ocp.folded(p)
-            self.made[key] = one, self.make(one)
+            method = self.make(one)
+            policy = policy_function(one, method)
+            self.made[key] = one, method, method if policy is None else policy
         return self.made[key]
 
 
@@ -68,7 +70,14 @@ class Laws(_Each):
         self.continuous = continuous
 
     def __call__(self, x: Array, t: float, p: Array) -> Array:
-        return np.vstack([np.atleast_2d(answer_of(self.at(one)[1], x[i:i + 1], t)) for i, one in enumerate(p)])
+        return np.vstack([self._answer(self.at(one)[2], x[i], t) for i, one in enumerate(p)])
+
+    @staticmethod
+    def _answer(controller: Any, x: Array, t: float) -> Array:
+        """u as a row [1, nu]."""
+        if isinstance(controller, ca.Function):
+            return np.asarray(controller(x, t).full().T)
+        return np.atleast_2d(answer_of(controller, x[None], t))
 
     def __reduce__(self) -> tuple[Any, ...]:
         return Laws, (self.ocp, self.make, self.continuous)  # what was made is made again
