@@ -43,8 +43,9 @@ def test_the_certificate_is_about_p(law, exported):
         assert set(finding.at) == {"x", "t", "p"}
         assert ((low <= finding.at["p"]) & (finding.at["p"] <= high)).all()
     assert len({tuple(f.at["p"]) for f in certificate.findings}) > 1  # p is drawn, too
-    kept = json.loads((folder / "parity.json").read_text())["findings"]
-    assert all(set(row["at"]) == {"x", "t", "p"} for row in kept)
+    kept = json.loads((folder / "parity.json").read_text())
+    assert all(set(row["at"]) == {"x", "t", "p"} for row in kept["findings"])
+    assert kept["inputs"] == {"x": ["pos", "v"], "p": ["mass [kg]", "goal [m]"]}
 
 
 def test_casadi_and_c_are_torch(law, exported):
@@ -77,7 +78,8 @@ def test_the_header_says_which_parameters_in_which_units(exported):
     lines = [line.split() for line in header.splitlines()]
     assert ["*", "p[0]", "mass", "[kg]", "in", "[0.8,", "1.2]"] in lines
     assert ["*", "p[1]", "goal", "[m]", "in", "[-1,", "1]"] in lines
-    assert "const double *p" in (folder / "README.md").read_text()
+    readme = (folder / "README.md").read_text()
+    assert "const double *x, double t, const double *p, double *u);`, with p = (mass [kg], goal [m])" in readme
     first = (folder / "mover_policy_vectors.csv").read_text().splitlines()
     assert first[1] == "x[0],x[1],t,p[0],p[1],u"
     drawn = np.array([[float(v) for v in line.split(",")] for line in first[2:]])[:, 3:5]

@@ -151,7 +151,9 @@ class _Export:
             if form not in missing:
                 getattr(self, f"_{form}")(form in to)
         points = min(len(z) for z in self.z.values())
-        return Certificate(self.findings, points, left_out)
+        inputs = {name: part.labels[name] for part in self.parts for name in part.casadi.name_in()
+                  if name in part.labels}
+        return Certificate(self.findings, points, left_out, inputs)
 
     def _compare(self, part: ExportPart, backend: str, dtype: str, values: parity.Rows,
                  slopes: parity.Rows | None = None) -> None:

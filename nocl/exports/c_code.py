@@ -435,10 +435,16 @@ def _readme(folder: Path, header: str, name: str) -> str:
     lines = {}
     for stem, text in sorted((headers | {name: header}).items()):
         if MARK in text.split("\n", 1)[0] and (declared := re.search(r"^int \w+\(.*\);$", text, re.MULTILINE)):
-            lines[stem] = f"- `{stem}.h`: `{declared[0]}`"
+            lines[stem] = f"- `{stem}.h`: `{declared[0]}`" + _parameters(text)
     first = next(iter(lines))
     return README.format(mark=MARK, names=", ".join(lines), list="\n".join(lines.values()), first=first,
                          called=first.rpartition("_")[2])
+
+
+def _parameters(header: str) -> str:
+    """What stands in an argument p, the parameters of a problem, as a header has it; "" where there is none."""
+    labels = re.findall(r"^ \*   p(?:\[\d+\])? +(\S.*?) +in \[", header, re.MULTILINE)
+    return f", with p = ({', '.join(labels)})" if labels else ""
 
 
 def _put(folder: Path, files: Mapping[str, str]) -> Path:

@@ -86,6 +86,7 @@ class Certificate:
     findings: Sequence[Finding]
     points: int
     left_out: Mapping[str, str] = field(default_factory=dict)
+    inputs: Mapping[str, Sequence[str]] = field(default_factory=dict)  # what stands in each, with its unit
 
     @property
     def ok(self) -> bool:
@@ -107,7 +108,8 @@ class Certificate:
         """As plain JSON data."""
         rows = [{**vars(f), "at": dict(f.at), "ok": f.ok} for f in self.findings]
         return {"summary": str(self), "ok": self.ok, "points": self.points, "left_out": dict(self.left_out),
-                "limits": LIMITS, "findings": rows}
+                "limits": LIMITS, "inputs": {name: list(labels) for name, labels in self.inputs.items()},
+                "findings": rows}
 
 
 def samples(part: ExportPart, n: int = 192, corners: int = 64, seed: int = 0) -> Array:
