@@ -149,15 +149,19 @@ def runs_of(ocp: OCP, methods: Mapping[str, Any], x0: Starts, rates: Rates, solv
 def _check(ocp: OCP, name: str, method: Any, x0: Starts) -> None:
     check_made_for(ocp, method, f"method {name!r}")
     if isinstance(method, Solution):
-        return _check_solution(ocp, name, method, x0)
-    if _policy(ocp, name, method) is not None:
-        return
+        _check_solution(ocp, name, method, x0)
+    elif _policy(ocp, name, method) is None:
+        _check_called(ocp, name, method)
+
+
+def _check_called(ocp: OCP, name: str, method: Any) -> None:
+    """Solvers and callables."""
     if not hasattr(method, "solve") and not callable(method):
         raise ValueError(f"method {name!r} is a {type(method).__name__}; expected a controller with to_casadi(), a "
                          "casadi.Function (x, t) -> u, a solver with solve(x0), a Solution, or a callable (x, t) -> u")
     if not is_plan(method):
-        return _named(name, check_takes_p, ocp, method)
-    if takes_p(ocp, method) and "p" not in inspect.signature(method.solve).parameters:
+        _named(name, check_takes_p, ocp, method)
+    elif takes_p(ocp, method) and "p" not in inspect.signature(method.solve).parameters:
         raise ValueError(f"method {name!r} is a {type(method).__name__}, whose solve takes no p, and the problem has "
                          f"the parameters {', '.join(ocp.parameter_names)}; expected solve(x0, p=): let it be made "
                          "anew at each p, nocl.comparisons.at_each(ocp, make)")
