@@ -63,7 +63,7 @@ def test_costs_are_riccatis_at_each_p(report):
     gaps = {row["method"]: row["gap_p95"] for row in report.summary()}
     assert gaps["LQR"] == pytest.approx(0, abs=1e-4)
     assert 0 < gaps["DDP"] < 2
-    assert gaps["NMPC"] == pytest.approx(gaps["DDP"], rel=1e-3)
+    assert gaps["NMPC"] == pytest.approx(gaps["DDP"], abs=1e-3)
     assert (of(report, "LQR of one").cost >= best * (1 - 1e-9)).all()
     assert gaps["LQR of one"] > 5  # it goes to another goal
     np.testing.assert_allclose(of(report, "LQR").terminal_error,
@@ -110,7 +110,7 @@ def test_the_page_knows_each_goal_and_p(ocp, report):
     goals = np.frombuffer(b64decode(data["goals"]), "<f4").reshape(N, 3)
     np.testing.assert_allclose(goals[:, 0], report.p[:, 1], rtol=1e-6)
     assert not goals[:, 1:].any()
-    plain = dataclasses.replace(ocp.at([1.0, 0.5]))
+    plain = ocp.at([1.0, 0.5])
     assert "p" not in payload(compare(plain, {"LQR": LQR(plain)}, n=2, progress=False))
 
 
@@ -154,10 +154,12 @@ def test_states_without_parameters_are_refused(ocp):
 
 
 def test_a_solver_made_at_each_p_solves_that_problem(ocp):
-    each = at_each(ocp, lambda one: DDP(one, intervals=20))
-    report = compare(ocp, {"each": each, "rows": DDP(ocp, intervals=20)}, n=3, progress=False)
-    np.testing.assert_allclose(report.cost[0], report.cost[1], rtol=1e-8)
-    assert at_each(ocp.at([1.0, 0.0]), LQR).K.shape == LQR(ocp.at([1.0, 0.0])).K.shape  # without p, the method itself
+    def make(one):
+        return NMPC(one, 20, starts=1, passes=0)
+
+    report = compare(ocp, {"each": at_each(ocp, make), "rows": make(ocp)}, n=3, progress=False)
+    np.testing.assert_allclose(report.cost[0], report.cost[1], rtol=1e-6)
+    assert isinstance(at_each(ocp.at([1.0, 0.0]), LQR), LQR)  # without parameters the method itself
 
 
 def test_a_failure_at_one_p_is_a_row(ocp):
@@ -179,14 +181,14 @@ def test_nmpc_as_feedback_has_each_p(ocp):
 
 
 def test_processes_and_a_folder_find_the_same(ocp, tmp_path):
-    methods = {"LQR": at_each(ocp, LQR), "by hand": proportional}
+    methods = {"LQR": at_each(ocp, LQR), "mine": lambda x, t, p: 3 * (p[:, 1:] - x[:, :1] - x[:, 1:])}
     alone = compare(ocp, methods, n=3, progress=False)
     shared = compare(ocp, methods, n=3, workers=2, out=tmp_path, progress=False)
     again = compare(ocp, methods, n=3, out=tmp_path, progress=False)
     for found in (shared, again):
         np.testing.assert_array_equal(found.cost, alone.cost)
-    other = compare(ocp, methods, n=3, out=tmp_path, progress=False, p=[1.0, 0.0])  # of another p nothing is taken
-    assert (other.cost != alone.cost).any()
+    with pytest.raises(ValueError, match="another run"):
+        compare(ocp, methods, n=3, out=tmp_path, progress=False, p=[1.0, 0.0])
 
 
 def test_a_study_holds_audits_and_stability_at_each_p(ocp):
