@@ -263,7 +263,7 @@ def count(k: int, what: str) -> str:
 def flat_rows(report: Results) -> list[Row]:
     """The rows with one column a coordinate: x0 as x0_NAME, p as p_NAME, x_end as end_NAME, x_end - x* as error_NAME.
     """
-    names, flat = report.ocp.system.state_names, []
+    names, flat = report.ocp.system.state_names, list[Row]()
     of = {"x0": ("x0", names), "p": ("p", report.ocp.parameter_names), "x_end": ("end", names),
           "error": ("error", names)}
     for row in report.rows():

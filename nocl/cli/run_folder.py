@@ -259,9 +259,11 @@ def solve(ocp: OCP, out: Path, name: str, n: int, options: registry.Options, wor
     planned = is_plan(method)
     s, arrays, facts = _solved(ocp, method, starts, workers, checkpoint) if planned else _simulated(ocp, method, starts)
     judged = _judged(ocp, starts, arrays) if planned else {}
-    with_p = {"p": starts.p} if ocp.np else {}
-    facts |= {"parameters": list(ocp.parameter_names)} if ocp.np else {"p": dict(at)} if at else {}
-    path = _write_arrays(out / f"{name}.npz", {"x0": starts.x, **with_p, **arrays, **judged})
+    if ocp.np:
+        arrays["p"], facts["parameters"] = starts.p, list(ocp.parameter_names)
+    if at:
+        facts["p"] = dict(at)
+    path = _write_arrays(out / f"{name}.npz", {"x0": starts.x, **arrays, **judged})
     store.write_json(out / f"{name}.json", {"solver": name, "n": n, "seed": fresh_seed(seed), **facts,
                                             "message": list(s.message)})
     _forget(checkpoint)
@@ -309,7 +311,7 @@ def _simulated(ocp: OCP, method: Any, starts: Starts) -> tuple[Any, dict[str, An
     if isinstance(method, Laws):
         (run,) = runs_of(ocp, {"law": method}, starts, (None,), Solving())
         job = Judging(ocp, starts, [run], Disturbance(), [0.0], timed=False)
-        s = job.judge(run, np.arange(len(starts)), 0.0).simulation
+        s = job.judge(run, np.arange(len(starts), dtype=np.int64), 0.0).simulation
     else:
         s = simulate(ocp, method, starts.x, hold=own_rate(ocp, method), p=starts.p)
     return s, {"t": s.t, "x": s.x, "u": s.u, "cost": s.cost, "success": s.success}, {}
