@@ -39,7 +39,8 @@ def promises(report: Report, within: float = WITHIN, confidence: float = CONFIDE
     if report.settings.get("seed") is None:
         return ()
     n, good = len(report.x0), report.within(within).sum(axis=1)
-    return tuple(Promise(j.name, within, confidence, n, int(k), lower_bound(int(k), n, confidence))
+    of = "initial states and parameters of these distributions" if report.ocp.np else Promise.of
+    return tuple(Promise(j.name, within, confidence, n, int(k), lower_bound(int(k), n, confidence), of)
                  for j, k in zip(report.judged, good, strict=True) if j.name != REFERENCE)
 
 

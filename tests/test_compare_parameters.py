@@ -206,6 +206,7 @@ def test_a_study_holds_audits_and_stability_at_each_p(ocp):
     middle = next(s for s in report.stability if (s.method, s.where) == ("P", "mid-horizon"))
     np.testing.assert_allclose(middle.gain[:, 0], -3 * report.p[:, :1] * [1, 1], rtol=1e-9)  # each its own mass
     assert len(report.promises) == 3
+    assert "of the initial states and parameters of these distributions end within 2 %" in str(report.promises[0])
     with pytest.raises(ValueError, match=r"study\(robust=True\) is not implemented for the parameter"):
         study(ocp, {"by hand": proportional}, n=1, robust=True, progress=False)
 

@@ -170,12 +170,12 @@ class Promise:
     n: int  # independent initial states
     successes: int
     share: float  # exact lower bound (Clopper, Pearson 1934), in [0, 1]
+    of: str = "initial states of this distribution"
 
     def __str__(self) -> str:
         share = math.floor(1000 * self.share) / 10  # rounded down: it is a bound
-        return (f"{self.method}: with {100 * self.confidence:g} % confidence, at least {share:g} % of the initial "
-                f"states of this distribution end within {self.within:g} % of the best known cost ({self.successes} of "
-                f"{self.n} did).")
+        return (f"{self.method}: with {100 * self.confidence:g} % confidence, at least {share:g} % of the {self.of} "
+                f"end within {self.within:g} % of the best known cost ({self.successes} of {self.n} did).")
 
 
 @dataclass(frozen=True, eq=False)
