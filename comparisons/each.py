@@ -49,17 +49,29 @@ def is_plan(method: Any) -> bool:
 class _Each:
     def __init__(self, ocp: OCP, make: Make) -> None:
         self.ocp, self.make = ocp, make
-        self.made: dict[bytes, tuple[OCP, Any, Any]] = {}  # by p's bytes
+        self.made: dict[bytes, tuple[OCP, Any, Any] | Exception] = {}  # by p's bytes
 
     def at(self, p: Array) -> tuple[OCP, Any, Any]:
-        """(the problem at parameters p [np], the method for it, its policy in CasADi or else itself)."""
+        """(the problem at parameters p [np], the method for it, its policy in CasADi or else itself).
+
+        Raises whatever making it raised.
+        """
         key = np.ascontiguousarray(p).tobytes()
         if key not in self.made:
-            one = self.ocp.folded(p)
-            method = self.make(one)
-            policy = policy_function(one, method)
-            self.made[key] = one, method, method if policy is None else policy
-        return self.made[key]
+            try:
+                self.made[key] = self._new(p)
+            except Exception as error:  # it would be raised again: once is enough
+                self.made[key] = error
+        found = self.made[key]
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+    def _new(self, p: Array) -> tuple[OCP, Any, Any]:
+        one = self.ocp.folded(p)
+        method = self.make(one)
+        policy = policy_function(one, method)
+        return one, method, method if policy is None else policy
 
 
 class Laws(_Each):
@@ -70,11 +82,14 @@ class Laws(_Each):
         self.continuous = continuous
 
     def __call__(self, x: Array, t: float, p: Array) -> Array:
-        return np.vstack([self._answer(self.at(one)[2], x[i], t) for i, one in enumerate(p)])
+        return np.vstack([self._answer(one, x[i], t) for i, one in enumerate(p)])
 
-    @staticmethod
-    def _answer(controller: Any, x: Array, t: float) -> Array:
-        """u as a row [1, nu]."""
+    def _answer(self, p: Array, x: Array, t: float) -> Array:
+        """u as a row [1, nu], NaN where there is no law at p: what was raised stands in the judge's row."""
+        try:
+            controller = self.at(p)[2]
+        except Exception:  # the other rows have answers
+            return np.full((1, self.ocp.system.nu), np.nan)
         if isinstance(controller, ca.Function):
             return np.asarray(controller(x, t).full().T)
         return np.atleast_2d(answer_of(controller, x[None], t))
