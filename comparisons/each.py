@@ -47,6 +47,8 @@ def is_plan(method: Any) -> bool:
 
 
 class _Each:
+    """What is made at each p, once."""
+
     def __init__(self, ocp: OCP, make: Make) -> None:
         self.ocp, self.make = ocp, make
         self.made: dict[bytes, tuple[OCP, Any, Any] | Exception] = {}  # by p's bytes
