@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -141,19 +142,26 @@ def test_packages_are_imported_by_their_nocl_name(name):
     assert not bare, f"{name} imports {bare}: write nocl.{bare[0]}"
 
 
-def loads(name: str, seen: set[str] | None = None) -> set[str]:
+@cache
+def loads(name: str) -> set[str]:
     """The heavy libraries that importing a module brings, by the imports at the top of it and of what it imports."""
-    seen = set() if seen is None else seen
-    if name in seen:
-        return set()
-    seen.add(name)
-    found = set()
-    body = ast.parse(FILES[name].read_text()).body
-    for node in [n for top in body for n in (top.body if isinstance(top, ast.Try) else [top])]:
-        for written in names_of(node):
-            library = written.partition(".")[0].lower()
-            found |= loads(module_of(written), seen) if library == "nocl" else {library} & HEAVY
+    found, seen, left = set(), set(), [name]
+    while left:
+        seen.add(now := left.pop())
+        libraries, modules = at_the_top(now)
+        found |= libraries
+        left += modules - seen
     return found
+
+
+@cache
+def at_the_top(name: str) -> tuple[set[str], set[str]]:
+    """(heavy libraries, modules of nocl) that a module imports itself, outside functions."""
+    body = ast.parse(FILES[name].read_text()).body
+    nodes = [n for top in body for n in (top.body if isinstance(top, ast.Try) else [top])]
+    written = [name for node in nodes for name in names_of(node)]
+    own = {module_of(w) for w in written if w.partition(".")[0] == "nocl"}
+    return {w.partition(".")[0].lower() for w in written} & HEAVY, own
 
 
 def names_of(node: ast.AST) -> list[str]:
