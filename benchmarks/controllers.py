@@ -37,6 +37,7 @@ from nocl.judge import Simulation, simulate
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.cnd import TrainSettings
+from nocl.solvers.cnd.in_torch import InTorch
 from nocl.solvers.cnd.labels import policy_controls
 from nocl.solvers.cnd.validate import feasible, kicked_optima, tube_optima, value_scores
 from nocl.solvers.ddp.bank import SolutionBank, better
@@ -63,13 +64,13 @@ def value_errors(ocp: OCP, cnd: nocl.CND, bank: SolutionBank, n: int, seed: int)
     """Mean |V - J*| / |J*|, and V_x against costates (medians), on n states of the tube about the bank's trajectories
     and n of the controller's own kicked rollouts, solved anew; none of them is among those that training drew. States
     that cannot hold the path constraints are left out."""
-    f, rng = nocl.to_torch(ocp.system.f), np.random.default_rng(seed)
+    acting, rng = (cnd.policy, InTorch(ocp)), np.random.default_rng(seed)
     fine = DDP(ocp, intervals=FINE // 2, constraints="soft")
     usual = TrainSettings()
-    sets = {"tube": tube_optima(DDP(ocp, constraints="soft"), fine, bank, cnd.policy, f, n, usual.width, rng),
-            "tails": kicked_optima(DDP(ocp, constraints="soft"), fine, bank, cnd.policy, f, n, usual.kick, rng)}
+    sets = {"tube": tube_optima(DDP(ocp, constraints="soft"), fine, bank, *acting, n, usual.width, rng),
+            "tails": kicked_optima(DDP(ocp, constraints="soft"), fine, bank, *acting, n, usual.kick, rng)}
     sets = {where: feasible(ocp, s) for where, s in sets.items()}
-    found, row = value_scores(ocp, cnd.value_net, cnd.policy, f, sets), {}
+    found, row = value_scores(cnd.value_net, *acting, sets), {}
     for where, s in sets.items():
         row |= {f"value_error_{where}_%": round(100 * found[f"{where}_error"], 3),
                 f"value_gradient_{where}_degrees": round(found[f"{where}_degrees"], 3),

@@ -122,12 +122,12 @@ def learned(args: argparse.Namespace, name: str) -> dict:
     ocp, rng = problem(name), np.random.default_rng(args.seed)
     exact = DDP(ocp, intervals=args.intervals, threads=1)
     bank = SolutionBank.of(exact, solve_globally(exact, ocp.initial_states.sample(20, args.seed), progress=False))
-    rows, t0, x = tube_states(bank, TAILS, 0.2, ocp.horizon, rng)
-    guess = bank.guess(rows, t0)
+    rows, at = tube_states(ocp, bank, TAILS, 0.2, rng)
+    guess = bank.guess(rows, at.t)
     result = {}
     for what, model in (("exact", None), ("learned", nocl.identify(ocp.system, seed=args.seed, progress=False))):
         ddp, built = timed(lambda m=model: DDP(ocp, intervals=args.intervals, dynamics=m, threads=1), 1)
-        found, seconds = timed(lambda d=ddp: d.solve(x, t0, **guess), 9, time.process_time)
+        found, seconds = timed(lambda d=ddp: d.solve(at.x, at.t, **guess), 9, time.process_time)
         result[what] = {"build s": built, "ms": 1e3 * seconds, "solved": float(found.success.mean()),
                         "iterations": float(found.iterations.mean()), "mean cost": float(found.cost.mean())}
     return result | {"tails": TAILS, "ratio": result["learned"]["ms"] / result["exact"]["ms"]}

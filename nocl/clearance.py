@@ -6,6 +6,8 @@ the problem takes place, at x* and at initial states: 1 % of a pillar's radius, 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from nocl.functions import Functions
@@ -16,31 +18,41 @@ LOWEST = 4  # samples from which a minimum of h is descended to
 NEVER = 1e-9  # of the spread of h over X: less deep than that is never violated there
 
 
-def scales(functions: Functions, place: Array) -> Array:
-    """The scale of each path constraint [m] > 0; place [n, nx]: states where the problem takes place."""
+Moments = dict[str, Array]  # times t [n] and parameters p [n, np] of n states
+
+
+def scales(functions: Functions, place: Array, moments: Callable[[int], Moments], there: Moments) -> Array:
+    """The scale of each path constraint [m] > 0.
+
+    place : states [n, nx] where the problem takes place, there: their times and parameters
+    moments : random times and parameters of n states
+    """
     s, rng = functions.system, np.random.default_rng(0)
-    box = rng.uniform(s.lbx, s.ubx, (SAMPLES, s.nx))
-    h, near = (_finite(functions.h(x.T).full()) for x in (box, place))
-    return np.array([_scale(functions, i, box, h[i], np.abs(near[i]).max()) for i in range(len(h))])
+    box, at = rng.uniform(s.lbx, s.ubx, (SAMPLES, s.nx)), moments(SAMPLES)
+    h, near = (_finite(functions.h(*functions.node.columns(x=x, **when)).full())
+               for x, when in ((box, at), (place, there)))
+    return np.array([_scale(functions, i, box, at, h[i], np.abs(near[i]).max()) for i in range(len(h))])
 
 
-def _scale(functions: Functions, i: int, box: Array, h: Array, near: float) -> float:
-    depth, spread = -_lowest(functions, i, box, h), float(np.ptp(h))
+def _scale(functions: Functions, i: int, box: Array, at: Moments, h: Array, near: float) -> float:
+    depth, spread = -_lowest(functions, i, box, at, h), float(np.ptp(h))
     sizes = [size for size in (depth if depth > NEVER * spread else spread, near) if size > 0]
     return min(sizes, default=1.0)
 
 
-def _lowest(functions: Functions, i: int, box: Array, h: Array) -> float:
+def _lowest(functions: Functions, i: int, box: Array, at: Moments, h: Array) -> float:
     """min h_i over X, by descent from the lowest samples: a thin obstacle lies between samples."""
     from scipy.optimize import minimize  # heavy
 
     s, weight = functions.system, np.eye(functions.h.numel_out(0))[i]
 
-    def value(x: Array) -> tuple[float, Array]:
-        values, slopes, _ = functions.h_derivatives(x, weight)
+    def value(x: Array, k: int) -> tuple[float, Array]:
+        here = functions.node.columns(x=x, t=at["t"][k], p=at["p"][k])
+        values, slopes, _ = functions.h_derivatives(*here, weight)
         return float(values[i]), np.asarray(slopes[i, :]).ravel()
 
-    found = [minimize(value, box[k], jac=True, method="L-BFGS-B", bounds=list(zip(s.lbx, s.ubx, strict=True))).fun
+    bounds = list(zip(s.lbx, s.ubx, strict=True))
+    found = [minimize(value, box[k], args=(k,), jac=True, method="L-BFGS-B", bounds=bounds).fun
              for k in np.argsort(h)[:LOWEST]]
     return float(np.nanmin([h.min(), *found]))
 

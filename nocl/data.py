@@ -65,6 +65,7 @@ class Dataset:
     def label(system: System, x: Array, u: Array) -> Dataset:
         """Exact labels at given rows x [N, nx], u [N, nu]."""
         checks.instance(System, system, "system", "Dataset.label", "of an OCP, pass ocp.system")
+        system.refuse_parameters("Dataset")
         x = checks.array(x, [None, system.nx], "x", "Dataset.label")
         n = len(x)
         u = checks.array(u, [n, system.nu], "u", "Dataset.label")
@@ -93,7 +94,8 @@ class Solution:
 
     A row as feedback is u = u_k + gain_k (x - x_k) on [t_k, t_k+1), from every solver: `gain` is du/dx, and 0 for a
     control that a bound holds. `LQR.K` alone has its field's sign, u = u* - K (x - x*). V, V_x, V_xx are the cost-to-go
-    at the nodes and its derivatives in x. NaN stands for what a solver does not know or was not asked for.
+    at the nodes and its derivatives in x, V_p is dJ*/dp. NaN stands for what a solver does not know or was not asked
+    for.
 
     Rows: `solution[rows]`, `Solution.join`, `put`. In time: `solution(t)`, `solution.feedback(x, t)`.
     """
@@ -114,17 +116,25 @@ class Solution:
     unit: Array | None = None  # [B], what costs of the problem usually are
     clearance: Array | None = None  # [B], min of all path constraints at the nodes; inf where there are none
     dense: Array | None = None  # [B, K, 4, 2 nx]: (x, costate) at both ends of intervals, their time derivatives
+    p: Array | None = None  # [B, np], the parameters of each problem; None where it has none
+    V_p: Array | None = None  # [B, np], dJ*/dp; None where there are no parameters
 
     def __len__(self) -> int:
         return len(self.cost)
 
+    @property
+    def parameters(self) -> Array:
+        """p [B, np], with no columns where the problem has none."""
+        return np.zeros((len(self), 0)) if self.p is None else self.p
+
     @staticmethod
-    def blank(t: Array, nx: int, nu: int) -> Solution:
-        """Rows without a solution yet, on the nodes t [B, K+1]."""
+    def blank(t: Array, nx: int, nu: int, p: Array | None = None) -> Solution:
+        """Rows without a solution yet, on the nodes t [B, K+1]; p [B, np], where the problem has parameters."""
+        known = {} if p is None or not p.shape[1] else {"p": p.copy(), "V_p": np.full(p.shape, np.nan)}
         B, K = len(t), t.shape[1] - 1
         x, u, gain, V = (np.full((B, *shape), np.nan) for shape in ((K + 1, nx), (K, nu), (K, nu, nx), (K + 1,)))
         return Solution(t, x, u, gain, V, x.copy(), np.full(B, np.inf), np.zeros(B, dtype=bool),
-                        np.full(B, "not tried"), np.zeros(B), np.zeros(B, dtype=np.int64))
+                        np.full(B, "not tried"), np.zeros(B), np.zeros(B, dtype=np.int64), **known)
 
     @property
     def costate(self) -> Array:

@@ -2,7 +2,9 @@
 
 A stage is one moment of a problem: f and L stand there as functions of (x, u). A node is where path constraints hold,
 h(x), and the end is where G(x) does. What acts on the problem, a policy or a value, is a function of (x, t). Each of
-these four is an `Arguments`, and all that is built from the problem anywhere is built on them:
+these four is an `Arguments`, and all that is built from the problem anywhere is built on them. A problem whose f, L or
+h holds the time has t in its stage and node; one with parameters has p, all of them, in all four, the last: stage
+(x, u, t, p), node (x, t, p), end (x, p), feedback (x, t, p). f has them all, too, also where it uses only some.
 
     at = ocp.functions.stage
     ocp.functions.f, .jacobian, .L, .L_soft, .h, .G, .L_derivatives ...   # ready CasADi functions
@@ -15,13 +17,14 @@ So an argument that f or L gains is written here, and where callers have its dat
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
 import casadi as ca
 
+from nocl.parameters import TIME, time
 from nocl.system import System
 from nocl.translate.arguments import Arguments
 from nocl.translate.rk4 import rk4_cost
@@ -36,7 +39,8 @@ class Functions:
     soft: ca.SX  # L_soft(x, u)
     constraints: ca.SX  # h(x), a column
     terminal: ca.SX  # G(x)
-    dynamics: ca.Function | None = None  # (x, u) -> xdot in place of the system's own f
+    dynamics: ca.Function | None = None  # (x, u[, t][, p of the system]) -> xdot in place of the system's own f
+    p: ca.SX = field(default_factory=lambda: ca.SX(0, 1))  # the problem's own parameters
 
     def on(self, dynamics: ca.Function) -> Functions:
         """The same problem under another f."""
@@ -44,40 +48,68 @@ class Functions:
         return self if known and dynamics is self.f else replace(self, dynamics=dynamics)
 
     @cached_property
+    def timed(self) -> bool:
+        """Whether f, L or h holds the time."""
+        t = time()
+        return self.system.uses_time or bool(ca.depends_on(ca.vertcat(self.soft, self.constraints), t))
+
+    @cached_property
+    def arguments(self) -> Arguments:
+        """(x, u[, t][, p]), in the system's and the problem's own symbols: what holds at one moment."""
+        own, p = self.system.arguments, self.p
+        if not p.numel() and (not self.timed or TIME in own.names):
+            return own
+        every = ca.vertcat(own["p"], p) if "p" in own.names else p
+        more = {**({TIME: time()} if self.timed else {}), **({"p": every} if every.numel() else {})}
+        return own.but(TIME, "p").given(**more)
+
+    @cached_property
     def stage(self) -> Stage:
-        """(x, u): in SX, or in MX where f is."""
-        own = self.system.arguments
+        """(x, u[, t][, p]): in SX, or in MX where f is."""
+        own = self.arguments
         if self.dynamics is None or self.dynamics.is_a("SXFunction"):
             return Stage(own.symbols, self)
         return Stage(Arguments.new(ca.MX, **{n: s.numel() for n, s in own.symbols.items()}).symbols, self)
 
     @property
     def node(self) -> Arguments:
-        """x, in SX: what `constraints` is an expression in."""
-        return self.system.arguments.but("u")
+        """(x[, t][, p]), in SX: what `constraints` is an expression in."""
+        return self.arguments.but("u")
 
     @property
     def end(self) -> Arguments:
-        """x, in SX: what `terminal` is an expression in."""
-        return self.system.arguments.but("u")
+        """(x[, p]), in SX: what `terminal` is an expression in."""
+        return self.arguments.but("u", TIME)
+
+    @property
+    def np(self) -> int:
+        """How many parameters there are, the system's and the problem's own."""
+        return self.arguments["p"].numel() if "p" in self.arguments.names else 0
 
     def feedback(self, kind: Any = ca.SX) -> Arguments:
-        """(x, t), new symbols of a kind, ca.SX or ca.MX: what policies and values are functions of."""
-        return Arguments.new(kind, x=self.system.nx, t=1)
+        """(x, t[, p]), new symbols of a kind, ca.SX or ca.MX: what policies and values are functions of."""
+        p = {"p": self.np} if self.np else {}
+        return Arguments.new(kind, x=self.system.nx, t=1, **p)
 
     @cached_property
     def f(self) -> ca.Function:
-        """(x, u) -> xdot."""
-        own, f = self.system.arguments, self.dynamics
-        if f is None or f.name_in() == own.names:
-            return self.system.f if f is None else f
-        given = Arguments.of(f).inputs
-        return Arguments(dict(zip(own.names, given, strict=True))).function(f.name(), {"xdot": f(*given)})
+        """(x, u[, t][, p]) -> xdot."""
+        f, own = self.dynamics, self.system.arguments
+        if f is None:
+            f = self.system.f
+        if f.name_in() == self.arguments.names and (not self.np or f.numel_in("p") == self.np):
+            return f
+        kind = ca.SX if f.is_a("SXFunction") else ca.MX
+        at = Arguments.new(kind, **{n: s.numel() for n, s in self.arguments.symbols.items()})
+        values = of_system(self.system, at)
+        named = all(name in own.names for name in f.name_in())
+        given = [values[name] for name in (f.name_in() if named else own.names[:f.n_in()])]
+        return at.function(f.name(), {"xdot": f(*given)})
 
     @cached_property
     def jacobian(self) -> ca.Function:
-        """(x, u) -> (A [nx, nx] = df/dx, B [nx, nu] = df/du), dense."""
-        if self.dynamics is None:
+        """(x, u[, t][, p]) -> (A [nx, nx] = df/dx, B [nx, nu] = df/du), dense."""
+        if self.dynamics is None and self.arguments.names == self.system.arguments.names and not self.p.numel():
             return self.system.jacobian
         at = self.stage
         return at.function("jacobian", {"A": ca.densify(ca.jacobian(at.xdot, at.x)),
@@ -85,47 +117,47 @@ class Functions:
 
     @cached_property
     def L(self) -> ca.Function:
-        """(x, u) -> running cost, a scalar."""
-        return self.system.arguments.function("L", {"L": self.running})
+        """(x, u[, t][, p]) -> running cost, a scalar."""
+        return self.arguments.function("L", {"L": self.running})
 
     @cached_property
     def L_soft(self) -> ca.Function:
-        """(x, u) -> running cost with the penalty of the path constraints."""
-        return self.system.arguments.function("L_soft", {"L": self.soft})
+        """(x, u[, t][, p]) -> running cost with the penalty of the path constraints."""
+        return self.arguments.function("L_soft", {"L": self.soft})
 
     @cached_property
     def h(self) -> ca.Function:
-        """x -> path constraints [number of them], each >= 0 where it holds."""
+        """(x[, t][, p]) -> path constraints [number of them], each >= 0 where it holds."""
         return self.node.function("h", {"h": self.constraints})
 
     @cached_property
     def G(self) -> ca.Function:
-        """x -> terminal cost, a scalar."""
+        """(x[, p]) -> terminal cost, a scalar."""
         return self.end.function("G", {"G": self.terminal})
 
     @cached_property
     def L_derivatives(self) -> ca.Function:
-        """(x, u) -> (L, L_z [nz], L_zz [nz, nz]), z = (x, u), dense; without the penalty."""
-        own = self.system.arguments
+        """(x, u[, t][, p]) -> (L, L_z [nz], L_zz [nz, nz]), z = (x, u), dense; without the penalty."""
+        own = self.arguments
         H, g = ca.hessian(self.running, ca.vertcat(own["x"], own["u"]))
         return own.function("L_derivatives", _dense({"L": self.running, "L_z": g, "L_zz": H}))
 
     @cached_property
     def G_derivatives(self) -> ca.Function:
-        """x -> (G, G_x [nx], G_xx [nx, nx]), dense."""
+        """(x[, p]) -> (G, G_x [nx], G_xx [nx, nx]), dense."""
         H, g = ca.hessian(self.terminal, self.end["x"])
         return self.end.function("G_derivatives", _dense({"G": self.terminal, "G_x": g, "G_xx": H}))
 
     @cached_property
     def h_derivatives(self) -> ca.Function:
-        """(x, mu) -> (h, h_x [n, nx], the Hessian of mu'h [nx, nx]), h_x with its own zeros."""
+        """(x[, t][, p], mu) -> (h, h_x [n, nx], the Hessian of mu'h [nx, nx]), h_x with its own zeros."""
         h, x = self.constraints, self.node["x"]
         mu = ca.SX.sym("mu", h.numel())
         H = ca.densify(ca.hessian(ca.dot(mu, h), x)[0])
         return self.node.function("h_derivatives", {"h": h, "h_x": ca.jacobian(h, x), "h_xx": H}, mu=mu)
 
     def step(self, *, soft: bool = True, substeps: int = 1) -> ca.Function:
-        """(x, u, h) -> (end, cost) of an interval of length h with u held, by RK4; see Stage.interval."""
+        """(x, u[, t][, p], h) -> (end, cost) of an interval from t to t + h with u held, by RK4; see Stage.interval."""
         at = self.stage
         h = at.sym("h")
         end, cost = at.interval(h, soft=soft, substeps=substeps)
@@ -133,7 +165,7 @@ class Functions:
 
 
 class Stage(Arguments):
-    """One moment of a problem under an f: x and u as symbols, and what stands there as expressions in them."""
+    """One moment of a problem under an f: x and u (t, p) as symbols, and what stands there as expressions in them."""
 
     def __init__(self, symbols: Mapping[str, Any], functions: Functions) -> None:
         super().__init__(symbols)
@@ -164,11 +196,29 @@ class Stage(Arguments):
         return (self.L_soft if soft else self.L) + ca.dot(costate, self.xdot)
 
     def interval(self, h: Any, *, soft: bool = True, substeps: int = 1) -> tuple[Any, Any]:
-        """(x after a time h with u held, the integral of L or L_soft over it), by RK4 steps."""
+        """(x after a time h with u held, the integral of L or L_soft over it), by RK4 steps; their stages are at t,
+        t + h / 2 and t + h.
+        """
         of = self.functions
-        L = of.L_soft if soft else of.L
-        return rk4_cost(lambda x, u: self.given(x=x, u=u).call(of.f), lambda x, u: self.given(x=x, u=u).call(L),
-                        self.x, self.u, h, substeps)
+        L, names = of.L_soft if soft else of.L, ["x", "u", *([TIME] if TIME in self.names else [])]
+
+        def at(function: ca.Function) -> Callable[..., Any]:
+            return lambda *values: self.given(**dict(zip(names, values, strict=True))).call(function)
+
+        t = self.symbols.get(TIME)
+        return rk4_cost(at(of.f), at(L), self.x, self.u, h, substeps, t)
+
+    @property
+    def of_system(self) -> list[Any]:
+        """What the system's own f is a function of, in its order."""
+        values = of_system(self.functions.system, self)
+        return [values[name] for name in self.functions.system.arguments.names]
+
+
+def of_system(system: System, at: Arguments) -> dict[str, Any]:
+    """The values of a system's own arguments among those of a problem on it: of p the first part."""
+    values = {name: at[name] for name in system.arguments.names}
+    return {**values, "p": values["p"][:system.np]} if "p" in values else values
 
 
 def _dense(outputs: Mapping[str, Any]) -> dict[str, Any]:

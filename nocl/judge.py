@@ -8,12 +8,15 @@ Three kinds of control are judged alike:
   of K equal intervals, its answer held;
 - open loop, where it is an array u [B, K, nu]: held.
 
+On a problem with parameters they are functions of (x, t, p), p [B, np]; those of a problem without, of (x, t).
+
 The judge clips every control to U, and starts CVODES anew wherever a control or a state jumps. Path constraints are
 judged between the nodes too, at BETWEEN times in each interval.
 """
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -29,6 +32,7 @@ from nocl.scales import units
 from nocl.smoothness import kinks
 from nocl.support import checks, interrupt
 from nocl.support.checks import Array
+from nocl.translate.arguments import Arguments
 
 Kicks = Sequence[tuple[float, ArrayLike]]
 MULTISTEP = ("adams", "bdf")  # the second, for stiff loops, where the first gives up; same tolerances
@@ -56,14 +60,15 @@ class Simulation:
 
 
 def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: int | None = None, nodes: int = 81,
-             kicks: Kicks | None = None, delay: float = 0.0, t0: float = 0.0, rtol: float = 1e-9,
+             kicks: Kicks | None = None, delay: float = 0.0, t0: float = 0.0, p: Any = None, rtol: float = 1e-9,
              atol: float = 1e-10) -> Simulation:
     """Run and score a controller on an OCP from states x0 [nx] or [B, nx].
 
     Parameters
     ----------
-    controller : policy:(x, t) -> u as a casadi.Function or by `to_casadi()`, callable, or controls [B, K, nu]
-    f : casadi.Function (x, u) -> xdot, or an object with `to_casadi()`
+    controller : policy:(x, t[, p]) -> u as a casadi.Function or by `to_casadi()`, callable, or controls [B, K, nu]
+    p : parameters, where the problem has them: [np] for all, [B, np], or by name (OCP.parameters_of)
+    f : casadi.Function (x, u[, t][, p]) -> xdot, or an object with `to_casadi()`
         Another plant than the exact one.
     hold : K, sample the feedback at K equal intervals; default: continuous where it can be, else nodes - 1
     nodes : number of nodes that continuous feedback is recorded at
@@ -80,7 +85,8 @@ def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: i
     t0 = _check_options(ocp, hold, nodes, t0)
     for name, tolerance in (("rtol", rtol), ("atol", atol)):
         checks.number(tolerance, name, "simulate", positive=True)
-    judge = _Judge(ocp, dynamics_function(ocp, f), float(rtol), float(atol))
+    values = ocp.parameters_of(p, len(rows), "simulate")
+    judge = _Judge(ocp, dynamics_function(ocp, f), values, float(rtol), float(atol))
     jumps = _jumps(ocp, kicks, len(rows), t0)
     policy = policy_function(ocp, controller)
     if policy is not None and hold is None:
@@ -90,7 +96,7 @@ def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: i
         ask, K = _open_loop(ocp, controller, len(rows), hold, t0)
         _check_delay(delay, 0.0, "open loop, which samples nothing")
     else:
-        ask, K = _feedback(ocp, controller, policy), hold or nodes - 1
+        ask, K = _feedback(ocp, controller, policy, values), hold or nodes - 1
         _check_delay(delay, (ocp.horizon - t0) / K, f"feedback that is sampled {K} times: sample it less often")
     return judge.held(ask, rows, np.linspace(t0, ocp.horizon, K + 1), jumps, delay)
 
@@ -98,14 +104,17 @@ def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: i
 def check_made_for(ocp: OCP, thing: Any, what: str) -> None:
     """ValueError where `thing` (a controller, a value function) was made for a problem on another system.
 
-    Other names of states and controls are refused of everything that has an `ocp`. Other equations are refused of what
-    was trained and may have been loaded (it has a card); a law that is built on a model on the spot, like LQR, may be
-    tried on the plant.
+    Other names of states and controls are refused of everything that has an `ocp`, and other parameters of what was
+    made for some. Other equations are refused of what was trained and may have been loaded (it has a card); a law that
+    is built on a model on the spot, like LQR, may be tried on the plant, and one for given parameters on others.
     """
     made_for = getattr(thing, "ocp", None)
     if not isinstance(made_for, OCP):
         return
-    differ = ocp.system.difference(made_for.system, equations=hasattr(thing, "card"))
+    names, own = made_for.parameter_names, ocp.parameter_names
+    differ = ocp.system.difference(made_for.system, equations=hasattr(thing, "card") and names == own)
+    if not differ and names and names != own:
+        differ = f"its parameters are {', '.join(names)}, not {', '.join(own) or 'none'}"
     if differ:
         raise ValueError(f"{what} was made for {made_for.system.name!r}, which is another system than this problem's "
                          f"{ocp.system.name!r}: {differ}; expected one made for it (to try a controller on another "
@@ -113,8 +122,8 @@ def check_made_for(ocp: OCP, thing: Any, what: str) -> None:
 
 
 def dynamics_function(ocp: OCP, f: Any) -> ca.Function:
-    """f as a casadi.Function (x, u) -> xdot, its inputs under these names: the exact one for None, a Function, or what
-    `to_casadi()` returns."""
+    """f as a casadi.Function (x, u[, t][, p]) -> xdot, its inputs under these names: the exact one for None, a
+    Function, or what `to_casadi()` returns; either is of (x, u), or of all that the system's own f is a function of."""
     s = ocp.system
     if f is None:
         return ocp.functions.f
@@ -122,31 +131,41 @@ def dynamics_function(ocp: OCP, f: Any) -> ca.Function:
     if g is None:
         raise ValueError(f"the dynamics are a {type(f).__name__}; expected a casadi.Function (x, u) -> xdot, "
                          "an object with to_casadi(), or None for the exact f")
-    return ocp.functions.on(_with_sizes(g, (s.nx, s.nu), s.nx, "the dynamics", "(x, u) -> xdot", s.name)).f
+    of = ocp.functions
+    forms = [(s.nx, s.nu), *(tuple(v.numel() for v in a.inputs) for a in (s.arguments, of.arguments))]
+    return of.on(_with_sizes(g, forms, s.nx, "the dynamics", "(x, u) -> xdot", s.name)).f
 
 
 def policy_function(ocp: OCP, controller: Any) -> ca.Function | None:
-    """The policy (x, t) -> u as a casadi.Function, or None where the controller has none; one of x alone gets a t."""
+    """The policy (x, t[, p]) -> u as a casadi.Function, or None where the controller has none; one of x alone, or of
+    (x, t), gets the rest.
+    """
     s = ocp.system
     g = controller if isinstance(controller, ca.Function) else _converted(controller)
     if g is not None and g.n_out() != 1:
         raise ValueError(f"the policy {g.name()} returns {', '.join(g.name_out())}; {s.name} needs one output, u: pick "
                          "it (of an ONNX file with from_onnx(path, outputs=[...]))")
-    if g is not None and [g.numel_in(i) for i in range(g.n_in())] == [s.nx]:
-        at = ocp.functions.feedback(ca.MX)
-        g = at.function(g.name(), {"u": g(at["x"] if g.size2_in(0) == 1 else at["x"].T)})
-    return g if g is None else _with_sizes(g, (s.nx, 1), s.nu, "the policy", "(x, t) -> u", s.name)
+    at = ocp.functions.feedback(ca.MX)
+    every = [v.numel() for v in at.inputs]
+    sizes = [] if g is None else [g.numel_in(i) for i in range(g.n_in())]
+    if g is not None and sizes in (every[:1], every[:2]) and sizes != every:
+        x = at["x"] if g.size2_in(0) == 1 else at["x"].T
+        g = at.function(g.name(), {"u": g(*[x, at["t"]][:len(sizes)])})
+    form = "(x, t) -> u" if not ocp.np else "(x, t, p) -> u"
+    return g if g is None else _with_sizes(g, [tuple(every)], s.nu, "the policy", form, s.name)
 
 
 def _converted(thing: Any) -> ca.Function | None:
     return thing.to_casadi() if hasattr(thing, "to_casadi") else None
 
 
-def _with_sizes(g: ca.Function, sizes: tuple[int, int], n_out: int, what: str, form: str, owner: str) -> ca.Function:
+def _with_sizes(g: ca.Function, forms: Sequence[tuple[int, ...]], n_out: int, what: str, form: str,
+                owner: str) -> ca.Function:
     got = [g.numel_in(i) for i in range(g.n_in())]
-    if tuple(got) != sizes or g.numel_out(0) != n_out:
+    if tuple(got) not in forms or g.numel_out(0) != n_out:
+        lengths = " or ".join(dict.fromkeys(str(list(sizes)) for sizes in forms))
         raise ValueError(f"{what} {g.name()} takes vectors of length {got} and returns {g.numel_out(0)}; {owner} needs "
-                         f"{form} with lengths {list(sizes)} -> {n_out}")
+                         f"{form} with lengths {lengths} -> {n_out}")
     return g
 
 
@@ -199,14 +218,35 @@ def _open_loop(ocp: OCP, controls: ArrayLike, B: int, hold: int | None, t0: floa
     return (lambda x, t, k: u[:, k]), u.shape[1]
 
 
-def _feedback(ocp: OCP, controller: Any, policy: ca.Function | None) -> Ask:
+def takes_p(ocp: OCP, controller: Any) -> bool:
+    """Whether a callable controller is one of (x, t, p): on a problem with parameters, unless made for one without."""
+    made_for = getattr(controller, "ocp", None)
+    return bool(ocp.np) and not (isinstance(made_for, OCP) and not made_for.np)
+
+
+def _check_takes_p(ocp: OCP, controller: Any) -> None:
+    try:
+        inspect.signature(controller).bind(None, 0.0, None)
+    except TypeError:
+        raise ValueError(f"the controller does not take (x, t, p), as those of a problem with the parameters "
+                         f"{', '.join(ocp.parameter_names)} do: expected a third argument, p [B, {ocp.np}]; where it "
+                         "needs none, lambda x, t, p: controller(x, t)") from None
+    except ValueError:  # a builtin without a signature
+        return
+
+
+def _feedback(ocp: OCP, controller: Any, policy: ca.Function | None, p: Array) -> Ask:
     nu = ocp.system.nu
     if policy is None and not callable(controller):
         raise ValueError(f"the controller is a {type(controller).__name__}; expected a callable (x, t) -> u, "
                          "a casadi.Function, an object with to_casadi(), or controls [B, K, nu]")
+    more = [p] if takes_p(ocp, controller) else []
+    if policy is None and more:
+        _check_takes_p(ocp, controller)
+    columns = [p.T] if ocp.np else []
 
     def ask(x: Array, t: float, k: int) -> Array:
-        answer = answer_of(controller, x, t) if policy is None else policy(x.T, t).full().T
+        answer = answer_of(controller, x, t, *more) if policy is None else policy(x.T, t, *columns).full().T
         u = checks.numeric(answer, "the controller's answer", "simulate", f"[B, nu] = [{len(x)}, {nu}]")
         if u.shape != (len(x), nu):
             raise ValueError(f"the controller answered with shape {u.shape} at t = {t:g}; expected [B, nu] = "
@@ -216,31 +256,31 @@ def _feedback(ocp: OCP, controller: Any, policy: ca.Function | None) -> Ask:
     return ask
 
 
-def answer_of(controller: Any, x: Array, t: float) -> Any:
-    """A callable's answer; ValueError where it does not take (x, t)."""
+def answer_of(controller: Any, x: Array, t: float, *p: Array | None) -> Any:
+    """A callable's answer; ValueError where it does not take (x, t), or (x, t, p)."""
     try:
-        return controller(x, t)
+        return controller(x, t, *p)
     except TypeError as error:
-        raise ValueError(f"the controller raised {error} at t = {t:g}; expected a callable (x [B, nx], t) -> u [B, nu]"
+        form = "(x [B, nx], t, p [B, np])" if p else "(x [B, nx], t)"
+        raise ValueError(f"the controller raised {error} at t = {t:g}; expected a callable {form} -> u [B, nu]"
                          ) from error
 
 
 class _Judge:
-    """CVODES on one problem and plant; z = [x, integral of L]."""
+    """CVODES on one problem and plant; z = [x, integral of L]. p [B, np] are the parameters of each row."""
 
-    def __init__(self, ocp: OCP, f: ca.Function, rtol: float, atol: float) -> None:
-        self.ocp, self.f = ocp, f
+    def __init__(self, ocp: OCP, f: ca.Function, p: Array, rtol: float, atol: float) -> None:
+        self.ocp, self.f, self.p = ocp, f, p
         self.options = {"reltol": rtol, "abstol": atol, "quad_err_con": True, "disable_internal_warnings": True,
                         "show_eval_warnings": False, "max_num_steps": 20000}
 
     @cached_property
     def jumps(self) -> str:
         """Where f jumps in X x U, in words; "" where it does not, or is no SX."""
-        s, at = self.ocp.system, self.ocp.functions.on(self.f).stage
+        at, box = self.ocp.functions.on(self.f).stage, self.ocp.stage_box
         if not isinstance(at.x, ca.SX):
             return ""
-        box = (np.r_[s.lbx, s.lbu], np.r_[s.ubx, s.ubu])
-        found = [kink for row in ca.vertsplit(at.xdot) for kink in kinks(row, at.z, *box)]
+        found = [kink for row in ca.vertsplit(at.xdot) for kink in kinks(row, ca.vertcat(*at.inputs), *box)]
         return ", ".join(dict.fromkeys(f"{kink.where} = 0" for kink in found if kink.what == "jump"))
 
     def blow_up(self, t: float, x: Array, until: float, what: str = "the state blows up") -> str:
@@ -256,21 +296,36 @@ class _Judge:
         return ca.integrator("judge", "cvodes", dae, 0.0, list(grid), options)
 
     def feedback_dae(self, policy: ca.Function) -> dict[str, Any]:
-        """dz/dtau = scale * (f, L)(x, clip(policy(x, t))), t = start + scale * tau; the quadrature is of ||u||."""
-        nx = self.ocp.system.nx
-        z, tau, p = ca.MX.sym("z", nx + 1), ca.MX.sym("tau"), ca.MX.sym("p", 2)
-        x = self.sized(z)[:nx]
-        u = self.clip(policy(x, p[0] + p[1] * tau))
-        ode = ca.vertcat(self.f(x, u), self.ocp.L(x, u))
+        """dz/dtau = scale * (f, L)(x, clip(policy(x, t))), t = start + scale * tau; the quadrature is of ||u||.
+
+        Its parameters are (start, scale, p).
+        """
+        nx, n = self.ocp.system.nx, self.ocp.np
+        z, tau, p = ca.MX.sym("z", nx + 1), ca.MX.sym("tau"), ca.MX.sym("p", 2 + n)
+        x, t = self.sized(z)[:nx], p[0] + p[1] * tau
+        u = self.clip(policy(x, t, *([p[2:]] if n else [])))
+        ode = self.rates(x, u, t, p[2:])
         return {"x": z, "t": tau, "p": p, "ode": p[1] * self.scaled(ode), "quad": p[1] * ca.norm_2(u)}
 
     def held_dae(self) -> dict[str, Any]:
-        """dz/dtau = scale * (f, L)(x, u), u held: an interval of any length is tau in [0, 1]."""
-        s = self.ocp.system
+        """dz/dtau = scale * (f, L)(x, u), u held: an interval of any length is tau in [0, 1].
+
+        Its parameters are (u, p, start, scale), `start` where the problem holds the time.
+        """
+        s, n, timed = self.ocp.system, self.ocp.np, self.ocp.uses_time
         sym: Any = ca.SX if self.f.is_a("SXFunction") else ca.MX
-        z, p = sym.sym("z", s.nx + 1), sym.sym("p", s.nu + 1)
-        x, u = self.sized(z)[:-1], p[:-1]
-        return {"x": z, "p": p, "ode": p[-1] * self.scaled(ca.vertcat(self.f(x, u), self.ocp.L(x, u)))}
+        z, p = sym.sym("z", s.nx + 1), sym.sym("p", s.nu + n + timed + 1)
+        x, u, scale = self.sized(z)[:-1], p[:s.nu], p[-1]
+        if not timed:
+            return {"x": z, "p": p, "ode": scale * self.scaled(self.rates(x, u, 0.0, p[s.nu:-1]))}
+        tau = sym.sym("tau")
+        ode = self.rates(x, u, p[-2] + scale * tau, p[s.nu:-2])
+        return {"x": z, "t": tau, "p": p, "ode": scale * self.scaled(ode)}
+
+    def rates(self, x: Any, u: Any, t: Any, p: Any) -> Any:
+        """(f, L) at one moment."""
+        at = Arguments({"x": x, "u": u, "t": t, "p": p})
+        return ca.vertcat(at.call(self.f), at.call(self.ocp.L))
 
     @cached_property
     def unit(self) -> Array:
@@ -314,17 +369,18 @@ class _Judge:
             segment = _Segment(self, dae, a, np.r_[t[inside], b])
             for i in range(B):
                 if not message[i]:
-                    path, magnitude_i, message[i] = segment.run(z[i])
+                    path, magnitude_i, message[i] = segment.run(z[i], self.p[i])
                     x[i, inside], z[i] = path[:-1, :nx], path[-1]
                     magnitude[i] += magnitude_i
         z[:, :nx] += sum(dx for time, dx in jumps if time == t[-1])
         x[:, -1] = z[:, :nx]
-        dense, x, t = x, x[:, ::m].copy(), nodes
-        u = policy(x.reshape(-1, nx).T, np.tile(t, B)[None]).full().T.reshape(B, len(t), -1)
+        least, x, t = self.ocp.least(x, t, self.p), x[:, ::m].copy(), nodes
+        p = [np.repeat(self.p, len(t), axis=0).T] if self.ocp.np else []
+        u = policy(x.reshape(-1, nx).T, np.tile(t, B)[None], *p).full().T.reshape(B, len(t), -1)
         u = np.clip(u, self.ocp.system.lbu, self.ocp.system.ubu)
         weight = np.gradient(t) * np.r_[0.5, np.ones(len(t) - 2), 0.5] if len(t) > 2 else np.diff(t).repeat(2) / 2
         saturation = self.at_bound(u) @ (weight / weight.sum())
-        return self.score(t, x, u, z[:, -1], magnitude / (t[-1] - t[0]), saturation, self.ocp.least(dense), message)
+        return self.score(t, x, u, z[:, -1], magnitude / (t[-1] - t[0]), saturation, least, message)
 
     def held(self, ask: Ask, x0: Array, t: Array, jumps: list[tuple[float, Array]], delay: float = 0.0) -> Simulation:
         B, nx, K, nu = len(x0), x0.shape[1], len(t) - 1, self.ocp.system.nu
@@ -344,11 +400,11 @@ class _Judge:
             for a, b in pairwise(edges):
                 z[:, :nx] += sum(dx for time, dx in middle if time == a)
                 path = step.run(z, u[:, k - 1] if a < late else u[:, k], a, b, message)
-                least = np.minimum(least, self.ocp.least(path))
+                least = np.minimum(least, self.ocp.least(path, a + (b - a) * step.grid, self.p))
         z[:, :nx] += sum(dx for time, dx in jumps if time == t[-1])
         x[:, -1], u[:, -1] = z[:, :nx], u[:, -2]
         magnitude = np.linalg.norm(u[:, :-1], axis=2).mean(axis=1)
-        least = np.minimum(least, self.ocp.least(x))
+        least = np.minimum(least, self.ocp.least(x, t, self.p))
         return self.score(t, x, u, z[:, -1], magnitude, self.at_bound(u[:, :-1]).mean(axis=1), least, message)
 
     def at_bound(self, u: Array) -> Array:
@@ -364,11 +420,12 @@ class _Judge:
 
     def score(self, t: Array, x: Array, u: Array, running: Array, magnitude: Array, saturation: Array,
               least: Array, message: list[str]) -> Simulation:
-        success = np.array([not m for m in message])
+        success, ocp = np.array([not m for m in message]), self.ocp
         x[~success, -1] = np.nan
-        terminal = np.where(success, self.ocp.G(x[:, -1].T).full().ravel(), np.inf)
+        end = ocp.functions.end.columns(x=x[:, -1], p=self.p)
+        terminal = np.where(success, ocp.G(*end).full().ravel(), np.inf)
         running = np.where(success, running, np.inf)
-        error = np.where(success, np.linalg.norm(self.ocp.from_goal(x[:, -1]), axis=1), np.inf)
+        error = np.where(success, np.linalg.norm(ocp.from_goal(x[:, -1], self.p), axis=1), np.inf)
         u[~np.isfinite(x).all(axis=2)] = np.nan
         return Simulation(t, x, u, running + terminal, running, terminal, error, np.where(success, magnitude, np.nan),
                           np.where(success, saturation, np.nan), least.min(axis=1, initial=np.inf),
@@ -382,23 +439,23 @@ class _Segment:
         self.judge, self.dae, self.a, self.times = judge, dae, float(a), times
         self.solvers = {MULTISTEP[0]: judge.integrator(dae, times - a, MULTISTEP[0])}
 
-    def run(self, z: Array) -> tuple[Array, float, str]:
-        """(z at the times [len(times), nx + 1], integral of ||u||, message)."""
+    def run(self, z: Array, p: Array) -> tuple[Array, float, str]:
+        """(z at the times [len(times), nx + 1], integral of ||u||, message) with the parameters p."""
         for method in MULTISTEP:
             if method not in self.solvers:
                 self.solvers[method] = self.judge.integrator(self.dae, self.times - self.a, method)
-            path, magnitude = self.judge.integrate(self.solvers[method], z, [self.a, 1.0])
+            path, magnitude = self.judge.integrate(self.solvers[method], z, np.r_[self.a, 1.0, p])
             if path is not None:
                 return path.T, magnitude, ""
-        return self.locate(z)
+        return self.locate(z, p)
 
-    def locate(self, z: Array) -> tuple[Array, float, str]:
+    def locate(self, z: Array, p: Array) -> tuple[Array, float, str]:
         """Run again interval by interval, to say where it failed."""
         path = np.full((len(self.times), len(z)), np.nan)
         each = [self.judge.integrator(self.dae, np.array([1.0]), method) for method in MULTISTEP]
         a = self.a
         for k, b in enumerate(self.times):
-            ends = (self.judge.integrate(step, z, [a, b - a])[0] for step in each)
+            ends = (self.judge.integrate(step, z, np.r_[a, b - a, p])[0] for step in each)
             end = next((e for e in ends if e is not None), None)
             if end is None:
                 return path, np.nan, self.judge.blow_up(a, z[:-1], float(b), "the state blows up or the control is NaN")
@@ -412,15 +469,17 @@ class _Step:
 
     def __init__(self, judge: _Judge) -> None:
         dae, self.m, self.judge = judge.held_dae(), judge.between, judge
-        grid = np.arange(1, self.m + 1) / self.m
-        self.solvers = [judge.integrator(dae, grid, method) for method in MULTISTEP]
+        self.grid = np.arange(1, self.m + 1) / self.m
+        self.solvers = [judge.integrator(dae, self.grid, method) for method in MULTISTEP]
 
     def run(self, z: Array, u: Array, a: float, b: float, message: list[str]) -> Array:
         """Advance the rows of z whose message is empty from time a to b; write a message where one fails.
 
         Returns the states on the way [B, m, nx], NaN where there are none.
         """
-        p, path = np.c_[u, np.full(len(u), b - a)], np.full((len(z), self.m, z.shape[1] - 1), np.nan)
+        start = [np.full(len(u), a)] if self.judge.ocp.uses_time else []
+        p = np.column_stack([u, self.judge.p, *start, np.full(len(u), b - a)])
+        path = np.full((len(z), self.m, z.shape[1] - 1), np.nan)
         for i in (i for i, m in enumerate(message) if not m):
             ends = (self.judge.integrate(solver, z[i], p[i])[0] for solver in self.solvers)
             end = next((e for e in ends if e is not None), None)

@@ -1,10 +1,10 @@
-"""An optimal control problem on a System: min of the integral of L(x, u) over [0, T], plus G(x(T))."""
+"""An optimal control problem on a System: min of the integral of L(x, u, t, p) over [0, T], plus G(x(T), p)."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any
@@ -12,20 +12,22 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from nocl import parameters as known
 from nocl import pretty, sampling
 from nocl.clearance import scales
 from nocl.functions import Functions
-from nocl.sampling import Distribution, Gaussian, Uniform, short
+from nocl.sampling import Distribution, Gaussian, Seed, Uniform, box, short
 from nocl.smoothness import kinks, linear_controls
 from nocl.support import checks
 from nocl.support.checks import MALFORMED, Array, Vector
-from nocl.system import System
+from nocl.system import System, check_unique, counted, parameter_text, read, refusal
 from nocl.translate import instructions
 from nocl.translate.instructions import check_scalar
 
 KINKS = ("solvers that use second derivatives may fail there; smooth it, nocl.smooth_abs(e, width) or "
          "nocl.smooth_max(a, b, width), or split a control, nocl.split_controls(system, names)")
 PLACES = 256  # initial states that constraints are measured at
+SAMPLES = 64  # initial states, and parameters, that a problem is tried at on construction
 N_IMAGES, SAME_IMAGE = 16, 1e-9  # points of the box; relative to usual values, images that agree so far are one
 
 
@@ -33,17 +35,27 @@ N_IMAGES, SAME_IMAGE = 16, 1e-9  # points of the box; relative to usual values, 
 class OCP:
     """min_u int_0^T L(x, u) dt + G(x(T)), subject to xdot = f(x, u), u in U, h(x) >= 0.
 
+    f, L and h may hold the time t = nocl.time() and parameters p, G parameters: f(x, u, t, p), L(x, u, t, p), G(x, p),
+    h(x, t, p). The order of p is the system's parameters, then the problem's own.
+
     Parameters
     ----------
     system : System
     horizon : float
         T, in the system's unit of time (seconds for those that come with nocl).
     running, terminal : casadi.SX
-        L(x, u) and G(x), scalars in the system's own symbols.
+        L(x, u) and G(x), scalars in the system's own symbols; t in G is the horizon.
     x_goal, u_goal : [nx], [nu]
-        The goal pair (x*, u*): it must lie in the system's boxes. L and G need not vanish there.
+        The goal pair (x*, u*): it must lie in the system's boxes. L and G need not vanish there. Either may be a
+        casadi.SX column in p, ca.vertcat(goal, 0): the attributes then hold its values at the nominal p, and
+        `goals(p)` those at any other.
     initial_states : Gaussian or Uniform
         Where trajectories start; what a trained controller must cover.
+    p : casadi.SX, optional
+        Parameters of the problem's own, nocl.parameter(name, nominal, unit): a goal, a weight, an obstacle's place.
+    parameters : Gaussian or Uniform
+        Of all parameters, the system's first, where there are any. Their nominal values are those that the parameters
+        were given, or else its centre.
     path_constraints : mapping from names to casadi.SX
         Each h(x), in the unit of a distance, must be >= 0 along the trajectory (an obstacle: distance minus radius).
     penalty, penalty_margin : float
@@ -62,6 +74,8 @@ class OCP:
     x_goal: Vector = field(kw_only=True)
     u_goal: Vector = field(kw_only=True)
     initial_states: Distribution = field(kw_only=True)
+    p: Any = field(default=None, kw_only=True)
+    parameters: Distribution | None = field(default=None, kw_only=True)
     path_constraints: Mapping[str, ca.SX] = field(default_factory=dict, kw_only=True)
     penalty: float = field(default=300.0, kw_only=True)
     penalty_margin: float = field(default=0.005, kw_only=True)
@@ -71,12 +85,15 @@ class OCP:
         s, owner = self.system, f"OCP on {self.system.name!r}"
         for name in ("horizon", "penalty", "penalty_margin"):
             self._set(**{name: checks.number(getattr(self, name), name, owner, positive=name == "horizon")})
-        z = ca.vertcat(s.x, s.u)
+        self._set(p=known.column(self.p, owner))
+        check_unique((*s.names, *self.parameter_names), False, owner)
+        t, p = known.time(), self._all_p
         self._check_constraints(owner)
-        self._set(running=checks.expression(self.running, 1, z, "running", owner),
-                  terminal=checks.expression(self.terminal, 1, s.x, "terminal", owner, s.u),
-                  x_goal=checks.vector(self.x_goal, s.nx, "x_goal", owner),
-                  u_goal=checks.vector(self.u_goal, s.nu, "u_goal", owner))
+        self._set(running=checks.expression(self.running, 1, ca.vertcat(s.x, s.u, p), "running", owner, time=t),
+                  terminal=checks.expression(self.terminal, 1, ca.vertcat(s.x, p), "terminal", owner, s.u, time=t))
+        self._check_parameters(owner)
+        for name, n in (("x_goal", s.nx), ("u_goal", s.nu)):
+            self._set(**{name: self._goal(getattr(self, name), n, name, owner)})
         self._check_goal(owner)
         self._check_initial_states(owner)
         self._check_finite(owner)
@@ -91,20 +108,63 @@ class OCP:
         if not isinstance(self.path_constraints, Mapping) or not all(isinstance(n, str) for n in self.path_constraints):
             raise ValueError(f"{owner}: path_constraints is {self.path_constraints!r}; expected a dict from names to "
                              "expressions that are >= 0 where they hold, {'wall': 2 - p}")
-        x, u = self.system.x, self.system.u
+        x, u, t = ca.vertcat(self.system.x, self._all_p), self.system.u, known.time()
         self._set(path_constraints=MappingProxyType(
-            {name: checks.expression(h, 1, x, f"path constraint {name!r}", owner, u)
+            {name: checks.expression(h, 1, x, f"path constraint {name!r}", owner, u, time=t)
              for name, h in self.path_constraints.items()}))
+
+    def _check_parameters(self, owner: str) -> None:
+        d, names = self.parameters, self.parameter_names
+        check_unique((*self.system.names, *names), self.uses_time, owner)
+        if d is None and not self.np:
+            return
+        words = f"the {counted(self.np, 'parameter')} {', '.join(names)}" if names else "no parameters"
+        if not isinstance(d, (Gaussian, Uniform)):
+            raise ValueError(f"{owner}: parameters is {d!r}; expected nocl.Gaussian or nocl.Uniform of {words}, in "
+                             "this order: say where they lie")
+        if d.n != self.np:
+            raise ValueError(f"{owner}: parameters has {counted(d.n, 'coordinate')}, but the problem has {words}: "
+                             "expected one for each, the system's first; declare others by p=")
+
+    def _goal(self, value: Any, n: int, name: str, owner: str) -> Array:
+        """The goal's numbers, at the nominal p where it depends on p."""
+        value = _goal_column(getattr(value, "expression", value))
+        if isinstance(value, ca.SX) and value.is_constant() and value.numel() == n:
+            value = ca.DM(value).full().ravel()
+        if not isinstance(value, ca.SX):
+            return checks.vector(value, n, name, owner)
+        return Goal.at(checks.expression(value, n, self._all_p, name, owner), self._all_p, self.nominal)
 
     def _check_goal(self, owner: str) -> None:
         s = self.system
-        boxes = [(s.state_names, self.x_goal, s.lbx, s.ubx, "x_goal"),
-                 (s.control_names, self.u_goal, s.lbu, s.ubu, "u_goal")]
-        for names, goal, lb, ub, what in boxes:
-            for name, g, low, high in zip(names, goal, lb, ub, strict=True):
-                if not low <= g <= high:
-                    raise ValueError(f"{owner}: {what} has {name} = {g:g}, outside its box [{low:g}, {high:g}]: "
-                                     "move the goal or widen the system's bounds")
+        p = np.vstack([self.nominal, self.sample_parameters(SAMPLES)])
+        x, u = self.goals(p)
+        boxes = [(s.state_names, x, s.lbx, s.ubx, "x_goal"), (s.control_names, u, s.lbu, s.ubu, "u_goal")]
+        for names, goals, lb, ub, what in boxes:
+            bad = np.argwhere(~((goals >= lb) & (goals <= ub)))
+            if len(bad):
+                row, i = bad[0]
+                raise ValueError(f"{owner}: {what} has {names[i]} = {goals[row, i]:g}{self._at(p[row])}, outside its "
+                                 f"box [{lb[i]:g}, {ub[i]:g}]: move the goal or widen the system's bounds")
+
+    def sample_parameters(self, n: int, seed: Seed = 0) -> Array:
+        """n parameters of their distribution [n, np]; nothing is drawn where there are none."""
+        return np.zeros((n, 0)) if self.parameters is None else self.parameters.sample(n, seed)
+
+    @property
+    def parameter_box(self) -> tuple[Array, Array]:
+        """Where parameters lie, [np] and [np]: of a Gaussian the usual range."""
+        return (np.zeros(0), np.zeros(0)) if self.parameters is None else box(self.parameters)
+
+    def _at(self, p: Array) -> str:
+        """Which parameters are meant, in words; "" where there are none."""
+        named = (f"{name} = {value:.4g}" for name, value in zip(self.parameter_names, p, strict=True))
+        return f" at {', '.join(named)}" if self.np else ""
+
+    def moments(self, n: int, seed: int = 0) -> dict[str, Array]:
+        """n random times in [0, T] and parameters, as {"t": [n], "p": [n, np]}: for what is found out by trying."""
+        return {"t": sampling.own_numbers(seed, 1).uniform(0, self.horizon, n),
+                "p": self.sample_parameters(n, sampling.own_numbers(seed, 2))}
 
     def _check_initial_states(self, owner: str) -> None:
         d = self.initial_states
@@ -120,31 +180,51 @@ class OCP:
                              f"box [{s.lbx[i]:g}, {s.ubx[i]:g}]: move it or widen lbx, ubx")
 
     def _check_finite(self, owner: str) -> None:
-        """Try the costs, the constraints and their derivatives at the goal and at initial states, with u = u*."""
-        s = self.system
-        z = ca.vertcat(s.x, s.u)
-        x = np.vstack([self.x_goal, self.initial_states.sample(64, 0)]).T
-        at = np.vstack([x, np.repeat(self.u_goal[:, None], x.shape[1], axis=1)])
+        """Try the costs, the constraints and their derivatives at the goal and at initial states, with u = u*; and f,
+        where it holds parameters or the time, in the box.
+        """
+        z, t = ca.vertcat(self.system.x, self.system.u), known.time()
+        x, at = np.vstack([self.x_goal, self.initial_states.sample(SAMPLES, 0)]).T, self.moments(SAMPLES + 1)
+        at["p"][0], inputs = self.nominal, [z, t, self._all_p]
+        values_of = [np.vstack([x, self.goals(at["p"])[1].T]), at["t"][None], at["p"].T]
         for what, value in [("running", self.running), ("terminal", self.terminal),
                             *((f"path constraint {name!r}", h) for name, h in self.path_constraints.items())]:
-            check_scalar(ca.Function("e", [z], [value]), f"{owner}: {what}")
+            check_scalar(ca.Function("e", inputs, [value]), f"{owner}: {what}")
             hessian, gradient = ca.hessian(value, z)
             for order, e in (("", value), ("the gradient of ", gradient), ("the second derivative of ", hessian)):
-                values = ca.Function("e", [z], [ca.vec(ca.densify(e))])(at).full()
+                values = ca.Function("e", inputs, [ca.vec(ca.densify(e))])(*values_of).full()
                 bad = np.flatnonzero(~np.isfinite(values).all(axis=0))
                 if bad.size:
                     where = "the goal" if bad[0] == 0 else "an initial state"
-                    raise ValueError(f"{owner}: {order}{what} gives NaN or inf at {where}, x = {short(x[:, bad[0]])}; "
-                                     "expected finite values: square a norm, or smooth it as sqrt(d^2 + 1e-6)")
+                    raise ValueError(f"{owner}: {order}{what} gives NaN or inf at {where}, x = {short(x[:, bad[0]])}"
+                                     f"{self._at(at['p'][bad[0]])}; expected finite values: square a norm, or smooth "
+                                     "it as sqrt(d^2 + 1e-6)")
+        if self.system.np or self.system.uses_time:
+            self._check_equations(owner)
+
+    def _check_equations(self, owner: str) -> None:
+        """Try f and its Jacobian at random states, controls, times and parameters."""
+        s, rng, at = self.system, np.random.default_rng(0), self.moments(PLACES)
+        if s.xdot is None:
+            return
+        x, u = rng.uniform(s.lbx, s.ubx, (PLACES, s.nx)), rng.uniform(s.lbu, s.ubu, (PLACES, s.nu))
+        of, z = self.functions, ca.vertcat(s.x, s.u)
+        both = of.arguments.function("both", {"f": s.equations, "slopes": ca.vec(ca.jacobian(s.equations, z))})
+        values = np.vstack([v.full() for v in both(*of.arguments.columns(x=x, u=u, **at))])
+        bad = np.flatnonzero(~np.isfinite(values).all(axis=0))
+        if bad.size:
+            i = int(bad[0])
+            raise ValueError(f"{owner}: the equations of {s.name!r} or their Jacobian give NaN or inf inside the box, "
+                             f"at x = {short(x[i])}, u = {short(u[i])}, t = {at['t'][i]:.4g}{self._at(at['p'][i])}; "
+                             "expected finite values: change the equation, or shrink lbx, ubx or `parameters`")
 
     @cached_property
     def kinks(self) -> tuple[str, ...]:
         """Where L, G or a path constraint is not smooth, in words."""
-        s, z = self.system, ca.vertcat(self.system.x, self.system.u)
-        lower, upper = np.r_[s.lbx, s.lbu], np.r_[s.ubx, s.ubu]
-        parts = {"the running cost": self.running, "the terminal cost": self.terminal,
+        z, every = ca.vertcat(self.system.x, self.system.u), ca.vertcat(*self.functions.arguments.inputs)
+        parts = {"the running cost": self.running, "the terminal cost": self.functions.terminal,
                  **{f"path constraint {name!r}": h for name, h in self.path_constraints.items()}}
-        return tuple(f"{what} has {kink}" for what, e in parts.items() for kink in kinks(e, z, lower, upper))
+        return tuple(f"{what} has {kink}" for what, e in parts.items() for kink in kinks(e, every, *self.stage_box, z))
 
     @property
     def not_smooth(self) -> str:
@@ -162,10 +242,11 @@ class OCP:
             return ()
         rng = np.random.default_rng(0)
         x, u = rng.uniform(s.lbx, s.ubx, (N_IMAGES, s.nx)).T, rng.uniform(s.lbu, s.ubu, (N_IMAGES, s.nu)).T
-        of = self.functions
+        of, at = self.functions, self.moments(N_IMAGES)
 
         def values(x: Array) -> Array:
-            return np.vstack([v.full() for v in (of.f(x, u), of.L(x, u), of.G(x), of.h(x))])
+            stage, node, end = (a.columns(x=x.T, u=u.T, **at) for a in (of.arguments, of.node, of.end))
+            return np.vstack([v.full() for v in (of.f(*stage), of.L(*stage), of.G(*end), of.h(*node))])
 
         here = values(x)
         usual = np.abs(here).max(axis=1, keepdims=True)
@@ -173,22 +254,131 @@ class OCP:
         return tuple(i for i in s.angle_indices
                      if (np.abs(values(x + turn[:, [i]]) - here) <= SAME_IMAGE * usual).all())
 
-    def from_goal(self, x: Any) -> Any:
-        """x - x*, from the nearest image of the goal: numpy rows [..., nx], or a CasADi column [nx]."""
+    @property
+    def _all_p(self) -> ca.SX:
+        """All parameters, the system's first."""
+        return ca.vertcat(self.system.p, self.p)
+
+    @property
+    def np(self) -> int:
+        """How many parameters the problem has, the system's and its own."""
+        return self.system.np + int(self.p.numel())
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        """The system's, then the problem's own."""
+        return self.system.parameter_names + known.names_of(self.p)
+
+    @cached_property
+    def nominal(self) -> Array:
+        """The nominal parameters [np]: as they were declared, or the centre of their distribution."""
+        if self.parameters is None:
+            return np.zeros(0)
+        given = known.nominal_of(self._all_p)
+        return np.where(np.isnan(given), self.parameters.centre, given)
+
+    @property
+    def stage_box(self) -> tuple[Array, Array]:
+        """(lower, upper) of (x, u[, t][, p]): X, U, [0, T] and where `parameters` lie."""
+        s = self.system
+        time = ([0.0], [self.horizon]) if self.uses_time else ([], [])
+        p = self.parameter_box
+        return np.r_[s.lbx, s.lbu, time[0], p[0]], np.r_[s.ubx, s.ubu, time[1], p[1]]
+
+    @cached_property
+    def uses_time(self) -> bool:
+        """Whether f, L or a path constraint holds the time."""
+        parts = ca.vertcat(self.running, *self.path_constraints.values())
+        return self.system.uses_time or bool(ca.depends_on(parts, known.time()))
+
+    def unit(self, name: str) -> str:
+        """The unit of a state, control or parameter for an axis label, like 'goal [m]'."""
+        unit = known.units_of(self.p).get(name)
+        return f"{name} [{unit}]" if unit else self.system.unit(name)
+
+    def parameters_of(self, p: Any, B: int, owner: str) -> Array:
+        """A user's parameters as rows [B, np]: p is [np] for all, [B, np], or a dict from names to numbers or [B].
+
+        None where the problem has none. Raises ValueError for what is missing, unknown, not finite or of another
+        shape; warns of extrapolation, values outside the box of `parameters`.
+        """
+        return known.rows(p, self.parameter_names, B, owner, self.parameters)
+
+    def refuse_parameters(self, owner: str) -> None:
+        """ValueError where the problem has parameters or holds the time: for what has no use of them, or not yet."""
+        if self.np or self.uses_time:
+            of = f"problem on {self.system.name!r}"
+            raise ValueError(refusal(owner, of, self.parameter_names, self.uses_time, "ocp"))
+
+    def at(self, p: Any = None) -> OCP:
+        """The problem with its parameters folded in as constants: p as [np] or by name, each of them."""
+        return self.folded(self.parameters_of(p, 1, f"OCP on {self.system.name!r}, at")[0])
+
+    def folded(self, value: Array) -> OCP:
+        """`at` parameters [np] that were checked."""
+        if not self.np:
+            return self
+        x_goal, u_goal = (goal[0] for goal in self.goals(value[None]))
+
+        def folded(e: ca.SX) -> ca.SX:
+            return ca.substitute(e, self._all_p, ca.DM(value))
+
+        with warnings.catch_warnings():  # of its kinks the problem itself has warned
+            warnings.simplefilter("ignore")
+            return replace(self, system=self.system.at(value[:self.system.np]), running=folded(self.running),
+                           terminal=folded(self.terminal), x_goal=x_goal, u_goal=u_goal, p=None, parameters=None,
+                           path_constraints={name: folded(h) for name, h in self.path_constraints.items()})
+
+    @cached_property
+    def goal(self) -> ca.Function:
+        """p -> (x_goal, u_goal); where they are constant, of any p."""
+        pair = {name: ca.SX(getattr(value, "expression", ca.DM(value)))
+                for name, value in (("x_goal", self.x_goal), ("u_goal", self.u_goal))}
+        return ca.Function("goal", [self._all_p], list(pair.values()), ["p"], list(pair))
+
+    @property
+    def goal_varies(self) -> bool:
+        """Whether the goal pair depends on p."""
+        return hasattr(self.x_goal, "expression") or hasattr(self.u_goal, "expression")
+
+    def goals(self, p: Array) -> tuple[Array, Array]:
+        """The goal pairs (x_goal [B, nx], u_goal [B, nu]) at parameters p [B, np]."""
+        if not self.goal_varies or not len(p):
+            x, u = (np.tile(np.asarray(goal), (len(p), 1)) for goal in (self.x_goal, self.u_goal))
+        else:
+            x, u = (goal.full().T for goal in self.goal(p.T))
+        return x, u
+
+    def from_goal(self, x: Any, p: Any = None) -> Any:
+        """x - x*, from the nearest image of the goal: numpy rows [..., nx], or a CasADi column [nx].
+
+        p : where the goal depends on it, [np] or a row for each of x's first axis [B, np], or a CasADi column
+        """
+        if self.goal_varies and p is None:
+            raise ValueError(f"OCP on {self.system.name!r}: the goal depends on {', '.join(self.parameter_names)}: "
+                             "pass p to from_goal")
         if not isinstance(x, (ca.SX, ca.MX)):
             given = checks.numeric(x, "x", "from_goal", f"numbers [..., {self.system.nx}]")
             if given.shape[-1:] != (self.system.nx,):
                 raise ValueError(f"from_goal: x has shape {given.shape}; expected [..., {self.system.nx}]")
-            rows = given - self.x_goal
+            rows = given - self._goal_beside(given.ndim, p)
             for i in self.periodic:
                 rows[..., i] -= 2 * np.pi * np.round(rows[..., i] / (2 * np.pi))
             return rows
         if x.shape != (self.system.nx, 1):
             raise ValueError(f"from_goal: x has shape {x.shape}; expected a column ({self.system.nx}, 1)")
-        d: Any = x - ca.DM(self.x_goal)
+        d: Any = x - (self.goal(p)[0] if self.goal_varies else ca.DM(self.x_goal))
         for i in self.periodic:
             d[i] = ca.remainder(d[i], 2 * np.pi)
         return d
+
+    def _goal_beside(self, axes: int, p: Any) -> Array:
+        """x* as it is subtracted from states [..., nx] with that many axes."""
+        if not self.goal_varies:
+            return self.x_goal
+        rows = np.asarray(p, dtype=np.float64)
+        goal = self.goals(np.atleast_2d(rows))[0]
+        return goal[0] if rows.ndim == 1 else beside(goal, axes)
 
     def check_strict(self, owner: str) -> None:
         """ValueError where the Hamiltonian is linear in a control, so that second derivatives say nothing of it."""
@@ -206,11 +396,12 @@ class OCP:
                   **options: Any) -> OCP:
         """L = (u - u*)' R (u - u*), G = (x - x*)' P (x - x*); `options` are OCP's other arguments.
 
-        R and P are numbers (times the identity), diagonals [n] or symmetric positive semidefinite matrices [n, n].
+        R and P are numbers (times the identity), diagonals [n] or symmetric positive semidefinite matrices [n, n]. The
+        goal may be expressions of p, and follows it.
         """
         owner = f"OCP on {checks.instance(System, system, 'system', 'OCP.quadratic').name!r}"
-        du = system.u - ca.DM(checks.vector(u_goal, system.nu, "u_goal", owner))
-        dx = system.x - ca.DM(checks.vector(x_goal, system.nx, "x_goal", owner))
+        du = system.u - _symbolic(u_goal, system.nu, "u_goal", owner)
+        dx = system.x - _symbolic(x_goal, system.nx, "x_goal", owner)
         return cls(system, running=_quadratic(checks.weight(R, system.nu, "R", owner), du),
                    terminal=_quadratic(checks.weight(P, system.nx, "P", owner), dx),
                    x_goal=x_goal, u_goal=u_goal, **options)
@@ -222,21 +413,23 @@ class OCP:
         for h in self.path_constraints.values():
             soft = soft + self.penalty * ca.fmax(self.penalty_margin - h, 0) ** 2
         h = ca.vertcat(ca.SX(0, 1), *self.path_constraints.values())
-        return Functions(self.system, self.running, soft, h, self.terminal)
+        G = ca.substitute(self.terminal, known.time(), self.horizon) if \
+            ca.depends_on(self.terminal, known.time()) else self.terminal
+        return Functions(self.system, self.running, soft, h, G, p=self.p)
 
     @property
     def L(self) -> ca.Function:
-        """(x, u) -> running cost, a scalar."""
+        """(x, u[, t][, p]) -> running cost, a scalar."""
         return self.functions.L
 
     @property
     def G(self) -> ca.Function:
-        """x -> terminal cost, a scalar."""
+        """(x[, p]) -> terminal cost, a scalar."""
         return self.functions.G
 
     @property
     def h(self) -> ca.Function:
-        """x -> path constraints [number of them], each >= 0 where it holds."""
+        """(x[, t][, p]) -> path constraints [number of them], each >= 0 where it holds."""
         return self.functions.h
 
     @cached_property
@@ -244,18 +437,27 @@ class OCP:
         """What violations of each path constraint are measured by [number of them]: see nocl/clearance.py."""
         if not self.path_constraints:
             return np.zeros(0)
+        at = self.moments(PLACES + 1)
+        at["p"][-1] = self.nominal
         places = self.initial_states.sample(PLACES, sampling.own_numbers(0))
-        return scales(self.functions, np.vstack([places, self.x_goal]))
+        return scales(self.functions, np.vstack([places, self.x_goal]), self.moments, at)
 
-    def least(self, x: Array) -> Array:
-        """The least value [B, number of them] of each path constraint along states x [B, n, nx]; inf for NaN."""
+    def least(self, x: Array, t: Any = None, p: Array | None = None) -> Array:
+        """The least value [B, number of them] of each path constraint along states x [B, n, nx]; inf for NaN.
+
+        t [n] or [B, n] and p [B, np] where the problem has them.
+        """
         n = self.system.nx
         x = checks.numeric(x, "x", "OCP.least", f"states [B, n, {n}]")
         if x.ndim != 3 or x.shape[2] != n or not x.shape[1]:
             raise ValueError(f"OCP.least: x has shape {x.shape}; expected [B, n, {n}]")
         if not self.path_constraints:
             return np.full((len(x), 0), np.inf)
-        h = self.h(x.reshape(-1, n).T).full().reshape(len(self.path_constraints), *x.shape[:2])
+        B, nodes = x.shape[:2]
+        times = None if t is None else np.broadcast_to(t, (B, nodes)).ravel()
+        rows = None if p is None else np.repeat(p, nodes, axis=0)
+        h = self.h(*self.functions.node.columns(x=x.reshape(-1, n), t=times, p=rows)).full()
+        h = h.reshape(len(self.path_constraints), B, nodes)
         return np.where(np.isfinite(h), h, np.inf).min(axis=2, initial=np.inf).T
 
     def violation(self, least: Array) -> Array:
@@ -268,20 +470,23 @@ class OCP:
 
     @property
     def L_soft(self) -> ca.Function:
-        """(x, u) -> running cost plus penalty * sum of max(margin - h(x), 0)^2: L itself without path constraints."""
+        """(x, u[, t][, p]) -> running cost plus penalty * sum of max(margin - h, 0)^2: L itself without constraints."""
         return self.functions.L_soft
 
     def __repr__(self) -> str:
-        z = ca.vertcat(self.system.x, self.system.u)
-        values = ca.vertcat(self.running, self.terminal, *self.path_constraints.values())
+        z = ca.vertcat(*self.functions.arguments.inputs)
+        values = ca.vertcat(self.functions.running, self.functions.terminal, *self.path_constraints.values())
         (L, G, *constraints), shared = pretty.lines(values, z, prefix="c")
         lines = [f"OCP on {self.system.name!r}: horizon {self.horizon:g}"]
         lines += [pretty.wrapped("L", L), pretty.wrapped("G", G)]
         lines += [pretty.filled(f"{name}: {h} >= 0")
                   for name, h in zip(self.path_constraints, constraints, strict=True)]
         lines += [pretty.wrapped(name, e, "    ") for name, e in shared.items()]
-        lines += [pretty.filled(f"goal: x* = {short(self.x_goal)}, u* = {short(self.u_goal)}"),
+        lines += [pretty.filled(f"goal: x* = {_goal_text(self.x_goal)}, u* = {_goal_text(self.u_goal)}"),
                   pretty.filled(f"x0 ~ {self.initial_states!r}")]
+        if self.np:
+            own = f", the problem's own: {parameter_text(self.p)}" if self.p.numel() else ""
+            lines.append(pretty.filled(f"p = ({', '.join(self.parameter_names)}) ~ {self.parameters!r}{own}"))
         return "\n".join([*lines, repr(self.system)])
 
     def to_data(self) -> dict[str, Any]:
@@ -290,7 +495,14 @@ class OCP:
                 "u_goal": self.u_goal.tolist(), "initial_states": sampling.to_data(self.initial_states),
                 "L": instructions.to_data(self.L), "G": instructions.to_data(self.G), "h": instructions.to_data(self.h),
                 "path_constraints": list(self.path_constraints),
-                "penalty": self.penalty, "penalty_margin": self.penalty_margin}
+                "penalty": self.penalty, "penalty_margin": self.penalty_margin, **self._parameter_data()}
+
+    def _parameter_data(self) -> dict[str, Any]:
+        """What to_data adds where there are parameters."""
+        if self.parameters is None:
+            return {}
+        varies = {"goal": instructions.to_data(self.goal)} if self.goal_varies else {}
+        return {"p": known.to_data(self.p), "parameters": sampling.to_data(self.parameters), **varies}
 
     @staticmethod
     def from_data(data: Mapping[str, Any]) -> OCP:
@@ -298,11 +510,15 @@ class OCP:
         checks.instance(Mapping, data, "data", "not an OCP written by nocl", "what to_data gave")
         try:
             system = System.from_data(data["system"])
-            x, u = system.x, system.u
-            constraints = ca.vertsplit(instructions.from_data(data["h"], [x])(x)) if data["path_constraints"] else []
-            return OCP(system, horizon=data["horizon"], x_goal=data["x_goal"], u_goal=data["u_goal"],
-                       running=instructions.from_data(data["L"], [x, u])(x, u),
-                       terminal=instructions.from_data(data["G"], [x])(x),
+            p = known.from_data(data.get("p", ()))
+            every = ca.vertcat(system.p, p)
+            at = {"x": system.x, "u": system.u, known.TIME: known.time(), "p": every}
+            constraints = ca.vertsplit(read(data["h"], at)) if data["path_constraints"] else []
+            goal = instructions.from_data(data["goal"], [every])(every) if "goal" in data else \
+                (data["x_goal"], data["u_goal"])
+            return OCP(system, horizon=data["horizon"], x_goal=goal[0], u_goal=goal[1],
+                       running=read(data["L"], at), terminal=read(data["G"], at), p=p,
+                       parameters=sampling.from_data(data["parameters"]) if "parameters" in data else None,
                        initial_states=sampling.from_data(data["initial_states"]),
                        path_constraints=dict(zip(data["path_constraints"], constraints, strict=True)),
                        penalty=data["penalty"], penalty_margin=data["penalty_margin"])
@@ -312,6 +528,43 @@ class OCP:
 
     def __reduce__(self) -> tuple[Any, ...]:
         return OCP.from_data, (self.to_data(),)  # bare SX does not pickle
+
+
+def beside(rows: Array, axes: int) -> Array:
+    """Rows [B, n] as they broadcast with an array [B, ..., n] of that many axes."""
+    return np.expand_dims(rows, tuple(range(1, axes - 1)))
+
+
+class Goal(np.ndarray[Any, np.dtype[np.float64]]):
+    """A goal that depends on p: its numbers at the nominal p, and its expression, which dataclasses.replace keeps."""
+
+    expression: ca.SX
+
+    @staticmethod
+    def at(expression: ca.SX, p: ca.SX, nominal: Array) -> Goal:
+        values = ca.Function("goal", [p], [expression])(nominal).full().ravel()
+        goal = values.view(Goal)
+        goal.expression = expression
+        goal.setflags(write=False)
+        return goal
+
+
+def _goal_text(goal: Array) -> str:
+    """A goal as text: numbers, or expressions of p."""
+    expression = getattr(goal, "expression", None)
+    return short(goal) if expression is None else str(expression)
+
+
+def _symbolic(goal: Any, n: int, name: str, owner: str) -> Any:
+    """A user's goal as a CasADi column: numbers, or expressions of p."""
+    goal = _goal_column(goal)
+    return goal if isinstance(goal, ca.SX) else ca.DM(checks.vector(goal, n, name, owner))
+
+
+def _goal_column(goal: Any) -> Any:
+    """A list with expressions of p in it as one SX column, other things as they are."""
+    mixed = isinstance(goal, (list, tuple)) and any(isinstance(g, ca.SX) for g in goal)
+    return checks.column(goal) if mixed else goal
 
 
 def _quadratic(W: Array, e: ca.SX) -> ca.SX:

@@ -1,4 +1,4 @@
-"""Distributions of states: seeded, frozen, rows [n, nx]."""
+"""Distributions of states and parameters: seeded, frozen, rows [n, nx]."""
 
 from __future__ import annotations
 
@@ -95,6 +95,14 @@ class Uniform:
 
 
 Distribution = Gaussian | Uniform
+BULK = 4.0  # standard deviations: one normal number in 16,000 is further from the mean
+
+
+def box(distribution: Distribution) -> tuple[Array, Array]:
+    """(lower, upper) of where nearly all of a distribution lies: a Uniform's bounds, BULK deviations of a Gaussian."""
+    if isinstance(distribution, Uniform):
+        return distribution.lb, distribution.ub
+    return distribution.mean - BULK * distribution.std, distribution.mean + BULK * distribution.std
 
 
 def to_data(distribution: Distribution) -> dict[str, Any]:

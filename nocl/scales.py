@@ -31,7 +31,9 @@ def usual_sizes(ocp: OCP) -> Sizes:
     s, rng = ocp.system, own_numbers(0)
     x = np.clip(ocp.initial_states.sample(SAMPLES, rng), s.lbx, s.ubx)  # far outside X costs are not usual
     u = rng.uniform(s.lbu, s.ubu, (SAMPLES, s.nu))
-    J = np.abs(ocp.horizon * ocp.L(x.T, u.T).full()) + np.abs(ocp.G(x.T).full())
+    of, at = ocp.functions, ocp.moments(SAMPLES)
+    L, G = (g(*a.columns(x=x, u=u, **at)).full() for g, a in ((of.L, of.arguments), (of.G, of.end)))
+    J = np.abs(ocp.horizon * L) + np.abs(G)
     J = J[np.isfinite(J) & (J > 0)]
     return Sizes((s.ubx - s.lbx) / 2, (s.ubu - s.lbu) / 2, float(np.median(J)) if J.size else 1.0)
 

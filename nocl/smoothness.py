@@ -41,9 +41,12 @@ class Kink:
         return f"a {self.what} where {self.where} = 0"
 
 
-def kinks(expression: ca.SX, z: ca.SX, lower: Array, upper: Array) -> list[Kink]:
-    """The kinks and jumps of a scalar expression in z [n] that lie in the box [lower, upper], one a switching term."""
-    names = [e for e in _switches(expression, z) if ca.depends_on(e, z)]
+def kinks(expression: ca.SX, z: ca.SX, lower: Array, upper: Array, of: ca.SX | None = None) -> list[Kink]:
+    """The kinks and jumps of a scalar expression in z [n] that lie in the box [lower, upper], one a switching term.
+
+    of : those of z in which they count (x and u, not p and t); default: all
+    """
+    names = [e for e in _switches(expression, z) if ca.depends_on(e, z if of is None else of)]
     if not names:
         return []
     rng = np.random.default_rng(0)
@@ -170,4 +173,4 @@ def split_controls(system: System, names: Sequence[str]) -> System:
               if n in system.units}
     xdot = at.given(u=ca.vertcat(*value)).call(system.f)
     return System(f"{system.name}_split", x=at["x"], u=ca.vertcat(*parts), xdot=xdot, lbu=lb, ubu=ub, lbx=system.lbx,
-                  ubx=system.ubx, angles=system.angles, units=units)
+                  ubx=system.ubx, p=at.symbols.get("p"), angles=system.angles, units=units)

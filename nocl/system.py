@@ -1,4 +1,4 @@
-"""A dynamical system xdot = f(x, u), written once in CasADi SX: the source of everything else."""
+"""A dynamical system xdot = f(x, u, t, p), written once in CasADi SX: the source of everything else."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nocl import pretty
+from nocl import parameters, pretty
 from nocl.support import checks
 from nocl.support.checks import MALFORMED, Array, Vector
 from nocl.translate import instructions
 from nocl.translate.arguments import Arguments
 
+Generator = np.random.Generator
 N_SAME, SAME = 16, 1e-9  # points, and relative to usual values: equations that agree so far are the same
 N_PROBES = 512  # points of the box at which the equations are tried on construction
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class System:
-    """xdot = f(x, u), x in the box [lbx, ubx] of R^nx, u in [lbu, ubu] of R^nu.
+    """xdot = f(x, u, t, p), x in the box [lbx, ubx] of R^nx, u in [lbu, ubu] of R^nu; t and p where f has them.
 
     Parameters
     ----------
@@ -34,8 +35,10 @@ class System:
     x, u : casadi.SX
         Columns of scalar symbols; their names are the names of the states and controls.
     xdot : casadi.SX or None
-        nx expressions in these symbols and nothing else; None where the equations are not known: logs teach them
-        (nocl.identify with `data`).
+        nx expressions in x, u, p and the time nocl.time(), and nothing else; None where the equations are not known:
+        logs teach them (nocl.identify with `data`).
+    p : casadi.SX, optional
+        A column of parameters, nocl.parameter(name, nominal, unit): constant along a trajectory (a mass, a length).
     lbu, ubu : [nu]
         Hard control bounds U, finite.
     lbx, ubx : [nx]
@@ -58,6 +61,7 @@ class System:
     ubu: Vector = field(kw_only=True)
     lbx: Vector = field(kw_only=True)
     ubx: Vector = field(kw_only=True)
+    p: Any = field(default=None, kw_only=True)
     angles: Sequence[str] = field(default=(), kw_only=True)
     units: Mapping[str, str] = field(default_factory=dict, kw_only=True)
 
@@ -68,14 +72,13 @@ class System:
         for name in ("x", "u"):  # copies: the caller may go on editing its own
             parts = checks.symbols(checks.column(getattr(self, name)), name, owner)
             self._set(**{name: checks.FrozenSX(ca.vertcat(*parts))})
-        repeated = sorted({n for n in self.names if self.names.count(n) > 1})
-        if repeated:
-            raise ValueError(f"{owner}: {', '.join(repeated)} occurs more than once in x and u; "
-                             "expected a symbol and a name of its own for each state and control")
+        self._set(p=parameters.column(self.p, owner))
+        check_unique((*self.names, *self.parameter_names), False, owner)
         if self.xdot is not None:
-            z = ca.vertcat(self.x, self.u)
-            self._set(xdot=checks.expression(checks.column(self.xdot), self.nx, z, "xdot", owner))
-            instructions.check_scalar(ca.Function("xdot", [z], [self.xdot]), f"{owner}: xdot")
+            z, t = ca.vertcat(self.x, self.u, self.p), parameters.time()
+            self._set(xdot=checks.expression(checks.column(self.xdot), self.nx, z, "xdot", owner, time=t))
+            instructions.check_scalar(ca.Function("xdot", [z, t], [self.xdot]), f"{owner}: xdot")
+        check_unique((*self.names, *self.parameter_names), self.uses_time, owner)
         lbu, ubu = checks.bounds(self.lbu, self.ubu, self.nu, ("lbu", "ubu"), owner, self.control_names)
         lbx, ubx = checks.bounds(self.lbx, self.ubx, self.nx, ("lbx", "ubx"), owner, self.state_names)
         self._set(lbu=lbu, ubu=ubu, lbx=lbx, ubx=ubx)
@@ -93,23 +96,31 @@ class System:
             raise ValueError(f"{owner}: angles is {self.angles!r}; expected a list of names of states "
                              f"({', '.join(self.state_names)})")
         angles = tuple(a for a in self.state_names if a in angles)
-        if not isinstance(self.units, Mapping) or any(n not in self.names for n in self.units):
+        named = (*self.names, *self.parameter_names)
+        if not isinstance(self.units, Mapping) or any(n not in named for n in self.units):
             raise ValueError(f"{owner}: units is {self.units!r}; expected a dict from names of states and controls "
-                             f"({', '.join(self.names)}) to units")
-        self._set(angles=angles, units=MappingProxyType(dict(self.units)))
+                             f"({', '.join(named)}) to units")
+        units = {**parameters.units_of(self.p), **self.units}
+        self._set(angles=angles, units=MappingProxyType(units))
 
     def _check_finite(self, owner: str) -> None:
-        """Try f and its Jacobian at the box's middle, its two extreme corners and random points."""
+        """Try f and its Jacobian at the box's middle, its two extreme corners and random points, at t = 0 and the
+        nominal parameters; where these are not all given, the OCP does, which knows their distribution.
+        """
+        if np.isnan(self.nominal).any():
+            return
+        moment: dict[str, Any] = {"t": 0.0, "p": self.nominal}
         rng = np.random.default_rng(0)
         lb, ub = np.r_[self.lbx, self.lbu], np.r_[self.ubx, self.ubu]
         z = np.vstack([(lb + ub) / 2, lb, ub, rng.uniform(lb, ub, (N_PROBES, len(lb)))]).T
         x, u = z[: self.nx], z[self.nx:]
-        values = np.vstack([self.f(x, u).full(), *(_stack(j, z.shape[1]) for j in self.jacobian(x, u))])
+        given = self.arguments.columns(x=x.T, u=u.T, **moment)
+        values = np.vstack([self.f(*given).full(), *(_stack(j, z.shape[1]) for j in self.jacobian(*given))])
         bad = np.flatnonzero(~np.isfinite(values).all(axis=0))
         if bad.size:
             k = int(bad[0])
             at = ", ".join(f"{n} = {v:.4g}" for n, v in zip(self.names, z[:, k], strict=True))
-            f = self.f(x[:, k], u[:, k]).full().ravel()
+            f = self.f(*self.arguments.columns(x=x[:, k], u=u[:, k], **moment)).full().ravel()
             rows = [n for n, v in zip(self.state_names, f, strict=True) if not np.isfinite(v)]
             what = f"the equation(s) of {', '.join(rows)}" if rows else "the Jacobian of xdot"
             raise ValueError(f"{owner}: {what} gives NaN or inf inside the box, at {at}; "
@@ -124,6 +135,10 @@ class System:
         return int(self.u.numel())
 
     @property
+    def np(self) -> int:
+        return int(self.p.numel())
+
+    @property
     def state_names(self) -> tuple[str, ...]:
         return tuple(s.name() for s in ca.vertsplit(self.x))
 
@@ -133,7 +148,27 @@ class System:
 
     @property
     def names(self) -> tuple[str, ...]:
+        """Those of the states, then of the controls."""
         return self.state_names + self.control_names
+
+    @property
+    def parameter_names(self) -> tuple[str, ...]:
+        return parameters.names_of(self.p)
+
+    @property
+    def nominal(self) -> Array:
+        """The nominal values of the parameters [np], NaN where none was given."""
+        return parameters.nominal_of(self.p)
+
+    @cached_property
+    def uses_time(self) -> bool:
+        """Whether xdot holds the time."""
+        return self.xdot is not None and bool(ca.depends_on(self.xdot, parameters.time()))
+
+    def refuse_parameters(self, owner: str) -> None:
+        """ValueError where f holds parameters or the time: for what has no use of them, or not yet."""
+        if self.np or self.uses_time:
+            raise ValueError(refusal(owner, f"system {self.name!r}", self.parameter_names, self.uses_time, "system"))
 
     @property
     def angle_indices(self) -> tuple[int, ...]:
@@ -150,75 +185,97 @@ class System:
 
     @cached_property
     def arguments(self) -> Arguments:
-        """(x, u), the system's own symbols: what xdot is a function of."""
-        return Arguments({"x": self.x, "u": self.u})
+        """(x, u[, t][, p]), the system's own symbols: what xdot is a function of."""
+        time = {parameters.TIME: parameters.time()} if self.uses_time else {}
+        return Arguments({"x": self.x, "u": self.u, **time, **({"p": self.p} if self.np else {})})
 
     @cached_property
     def f(self) -> ca.Function:
-        """(x [nx], u [nu]) -> xdot [nx]."""
+        """(x [nx], u [nu][, t][, p [np]]) -> xdot [nx]."""
         return self.arguments.function("f", {"xdot": self.equations})
 
     @cached_property
     def jacobian(self) -> ca.Function:
-        """(x, u) -> (A [nx, nx] = df/dx, B [nx, nu] = df/du), dense."""
+        """(x, u[, t][, p]) -> (A [nx, nx] = df/dx, B [nx, nu] = df/du), dense."""
         A, B = (ca.densify(ca.jacobian(self.equations, v)) for v in (self.x, self.u))
         return self.arguments.function("jacobian", {"A": A, "B": B})
 
-    def linearize(self, x: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
-        """(A, B) at (x, u), as numpy arrays [nx, nx] and [nx, nu]."""
+    def linearize(self, x: ArrayLike, u: ArrayLike, t: float = 0.0, p: Any = None) -> tuple[Array, Array]:
+        """(A, B) at (x, u), as numpy arrays [nx, nx] and [nx, nu]; at time t and parameters p where f has them."""
         owner = f"{self.name}.linearize"
-        A, B = self.jacobian(checks.vector(x, self.nx, "x", owner), checks.vector(u, self.nu, "u", owner))
+        x, u = checks.vector(x, self.nx, "x", owner), checks.vector(u, self.nu, "u", owner)
+        rows = parameters.rows(p, self.parameter_names, 1, owner)
+        A, B = self.jacobian(*self.arguments.columns(x=x, u=u, t=t, p=rows))
         if not (np.isfinite(A.full()).all() and np.isfinite(B.full()).all()):
             raise ValueError(f"{owner}: the Jacobian is NaN or inf at x = {checks.shown(x)}, u = {checks.shown(u)}; "
                              "expected a point where xdot is differentiable")
         return A.full(), B.full()
 
+    def at(self, p: Any) -> System:
+        """The system with its parameters folded in as constants: p as [np], or by name."""
+        value = parameters.rows(p, self.parameter_names, 1, f"{self.name}.at")[0]
+        units = {n: unit for n, unit in self.units.items() if n not in self.parameter_names}
+        xdot = None if self.xdot is None else ca.substitute(self.xdot, self.p, ca.DM(value))
+        return replace(self, xdot=xdot, p=None, units=units)
+
     def difference(self, other: System, equations: bool = True) -> str:
-        """What tells another system from this one, names or (where asked) equations; "" where they are the same."""
+        """What tells another system from this one, names of states and controls or (where asked) parameters and
+        equations; "" where they are the same."""
         checks.instance(System, other, "other", f"{self.name}.difference", "of an OCP, pass ocp.system")
+        checks.flag(equations, "equations", f"{self.name}.difference")
+        parameters = [("parameters", self.parameter_names, other.parameter_names)] if equations else []
         for what, own, theirs in (("states", self.state_names, other.state_names),
-                                  ("controls", self.control_names, other.control_names)):
+                                  ("controls", self.control_names, other.control_names), *parameters):
             if own != theirs:
-                return f"its {what} are {', '.join(theirs)}, not {', '.join(own)}"
-        known = self.xdot is not None and other.xdot is not None
-        if not checks.flag(equations, "equations", f"{self.name}.difference") or not known or self.xdot is other.xdot:
+                return f"its {what} are {', '.join(theirs) or 'none'}, not {', '.join(own) or 'none'}"
+        if not equations or self.xdot is None or other.xdot is None or self.xdot is other.xdot:
             return ""
         rng = np.random.default_rng(0)
         x = rng.uniform(self.lbx, self.ubx, (N_SAME, self.nx)).T
         u = rng.uniform(self.lbu, self.ubu, (N_SAME, self.nu)).T
-        own, theirs = self.f(x, u).full(), other.f(x, u).full()
+        at = {"x": x.T, "u": u.T, **self._moments(rng)}
+        own, theirs = (s.f(*s.arguments.columns(**at)).full() for s in (self, other))
         usual = np.abs(own).max(axis=1, keepdims=True)
         rows = np.flatnonzero((~(np.abs(theirs - own) <= SAME * (usual + np.abs(own)))).any(axis=1))
         return "its equation(s) of " + ", ".join(self.state_names[i] for i in rows) + " are others" if rows.size else ""
 
+    def _moments(self, rng: Generator) -> dict[str, Array]:
+        """N_SAME times and values of the parameters, about their nominal ones or 1."""
+        usual = np.where(np.isfinite(self.nominal), self.nominal, 1.0)
+        return {"t": rng.random(N_SAME), "p": usual * rng.uniform(0.8, 1.2, (N_SAME, self.np))}
+
     def under(self, f: ca.Function) -> System:
-        """The system with another f:(x, u) -> xdot for its equations, in its own symbols: f is written out in SX."""
-        sizes = [self.nx, self.nu]
+        """The system with another f:(x, u[, t][, p]) -> xdot for its equations, in its own symbols and SX."""
+        sizes = [v.numel() for v in self.arguments.inputs]
         if not isinstance(f, ca.Function) or [f.numel_in(i) for i in range(f.n_in())] != sizes or \
                 [f.numel_out(i) for i in range(f.n_out())] != [self.nx]:
-            raise ValueError(f"{self.name}.under: f is {checks.shown(f)}; expected a casadi.Function (x [{self.nx}], "
-                             f"u [{self.nu}]) -> xdot [{self.nx}]")
+            form = ", ".join(f"{name} [{n}]" for name, n in zip(self.arguments.names, sizes, strict=True))
+            raise ValueError(f"{self.name}.under: f is {checks.shown(f)}; expected a casadi.Function ({form}) -> xdot "
+                             f"[{self.nx}]")
         f = f if f.is_a("SXFunction") else instructions.expand(f)
         return replace(self, xdot=f(*self.arguments.inputs))
 
     def unit(self, name: str) -> str:
-        """The unit of a state or control for an axis label, like 'theta [rad]' or just 'theta'."""
-        checks.word(name, self.names, "name", f"{self.name}.unit")
+        """The unit of a state, control or parameter for an axis label, like 'theta [rad]' or just 'theta'."""
+        checks.word(name, (*self.names, *self.parameter_names), "name", f"{self.name}.unit")
         return f"{name} [{self.units[name]}]" if name in self.units else name
 
     def __repr__(self) -> str:
         def interval(name: str, low: float, high: float) -> str:
             return f"{name} in [{low:g}, {high:g}]" + (" (angle)" if name in self.angles else "")
 
-        lines = [f"System {self.name!r}: {counted(self.nx, 'state')}, {counted(self.nu, 'control')}"]
+        counts = f"{counted(self.nx, 'state')}, {counted(self.nu, 'control')}"
+        lines = [f"System {self.name!r}: {counts}" + (f", {counted(self.np, 'parameter')}" if self.np else "")]
         if self.xdot is None:
             lines.append("equations not known")
         else:
-            rows, shared = pretty.lines(self.xdot, ca.vertcat(self.x, self.u))
+            rows, shared = pretty.lines(self.xdot, ca.vertcat(*self.arguments.inputs))
             lines += [pretty.wrapped(f"d{n}/dt", e) for n, e in zip(self.state_names, rows, strict=True)]
             lines += [pretty.wrapped(name, e, "    ") for name, e in shared.items()]
         lines.append(pretty.filled("X: " + ", ".join(map(interval, self.state_names, self.lbx, self.ubx))))
         lines.append(pretty.filled("U: " + ", ".join(map(interval, self.control_names, self.lbu, self.ubu))))
+        if self.np:
+            lines.append(pretty.filled("p: " + parameter_text(self.p)))
         return "\n".join(lines)
 
     def to_data(self) -> dict[str, Any]:
@@ -226,6 +283,7 @@ class System:
         return {"name": self.name, "x": list(self.state_names), "u": list(self.control_names),
                 "f": None if self.xdot is None else instructions.to_data(self.f),
                 "angles": list(self.angles), "units": dict(self.units),
+                **({"p": parameters.to_data(self.p)} if self.np else {}),
                 **{name: getattr(self, name).tolist() for name in ("lbu", "ubu", "lbx", "ubx")}}
 
     @staticmethod
@@ -234,8 +292,10 @@ class System:
         checks.instance(Mapping, data, "data", "not a System written by nocl", "what to_data gave")
         try:
             x, u = (ca.vertcat(*map(ca.SX.sym, data[names])) for names in ("x", "u"))
-            xdot = None if data["f"] is None else instructions.from_data(data["f"], [x, u])(x, u)
-            return System(data["name"], x=x, u=u, xdot=xdot, angles=data["angles"], units=data["units"],
+            p = parameters.from_data(data.get("p", ()))
+            at = {"x": x, "u": u, parameters.TIME: parameters.time(), "p": p}
+            xdot = None if data["f"] is None else read(data["f"], at)
+            return System(data["name"], x=x, u=u, xdot=xdot, p=p, angles=data["angles"], units=data["units"],
                           **{name: data[name] for name in ("lbu", "ubu", "lbx", "ubx")})
         except MALFORMED as error:
             raise ValueError(f"not a System written by nocl: {type(error).__name__}: {error}; expected what to_data "
@@ -271,6 +331,44 @@ def _named(names: Sequence[str] | None, n: int, letter: str, what: str, owner: s
     if len(chosen) != n:
         raise ValueError(f"System.from_casadi: {what} has {len(chosen)} names; {owner} has {n}: give each a name")
     return ca.vertcat(*map(ca.SX.sym, chosen))
+
+
+def check_unique(names: Sequence[str], timed: bool, owner: str) -> None:
+    """ValueError where a name stands twice among those of states, controls, parameters and, where it is used, t."""
+    taken = [*names, *([parameters.TIME] if timed else [])]
+    repeated = sorted({n for n in taken if taken.count(n) > 1})
+    if repeated:
+        also = ", and t is the time" if parameters.TIME in repeated and timed else ""
+        raise ValueError(f"{owner}: {', '.join(repeated)} occurs more than once in x and u (or p); "
+                         f"expected a symbol and a name of its own for each state, control and parameter{also}")
+
+
+def read(data: Mapping[str, Any], at: Mapping[str, ca.SX]) -> ca.SX:
+    """What a function of data (instructions.to_data) is in symbols, those that its inputs are named by."""
+    symbols = [at[name] for name, *_ in data["inputs"]]
+    return instructions.from_data(data, symbols)(*symbols)
+
+
+def parameter_text(p: ca.SX) -> str:
+    """A column of parameters in words: 'mass = 1 kg, goal [m]', nominal values where they are given."""
+    units = parameters.units_of(p)
+
+    def text(name: str, value: float) -> str:
+        unit = units.get(name, "")
+        if np.isnan(value):
+            return f"{name} [{unit}]" if unit else name
+        return f"{name} = {value:g}" + (f" {unit}" if unit else "")
+
+    return ", ".join(map(text, parameters.names_of(p), parameters.nominal_of(p)))
+
+
+def refusal(owner: str, of: str, names: Sequence[str], time: bool, variable: str) -> str:
+    """The message of what takes no problem with parameters or time, or not yet."""
+    has = [*([f"the parameter(s) {', '.join(names)}"] if names else []), *(["the time t"] if time else [])]
+    remedy = f"one with its parameters folded in, {variable}.at(p=...)" if names else "one without t"
+    also = ", and without t" if names and time else ""
+    return (f"{owner} is not implemented for {' and for '.join(has)}, which the {of} has; expected one without: "
+            f"pass {remedy}{also}")
 
 
 def counted(n: int, noun: str) -> str:

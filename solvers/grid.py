@@ -23,6 +23,7 @@ from nocl.support.checks import Array
 
 ROWS = 4  # solutions that are looked at
 SMALL = 1e-3  # of the usual cost: below it, errors count as shares of that
+Stages = dict[str, Array]  # x [n, nx], u [n, nu], t [n], p [n, np]
 
 
 def measured(ocp: OCP, functions: Functions, solution: Solution, substeps: int) -> Grid | None:
@@ -31,28 +32,34 @@ def measured(ocp: OCP, functions: Functions, solution: Solution, substeps: int) 
     if not len(solution):
         return None
     step = float(np.diff(solution.t, axis=1).max())
-    x, u = solution.x[:, :-1].reshape(-1, ocp.system.nx), solution.u.reshape(-1, ocp.system.nu)
-    return grid_of(step, substeps, _errors(ocp, functions, solution), fastest(functions, x, u))
+    return grid_of(step, substeps, _errors(ocp, functions, solution), fastest(functions, _stages(solution)))
 
 
 def fastest_at_start(ocp: OCP, functions: Functions) -> float:
     """The shortest time constant of f at some initial states under u*."""
-    return fastest(functions, ocp.initial_states.sample(ROWS, own_numbers(0)), np.tile(ocp.u_goal, (ROWS, 1)))
+    x, p = firsts(ocp)
+    return fastest(functions, {"x": x, "u": ocp.goals(p)[1], "t": np.zeros(ROWS), "p": p})
+
+
+def firsts(ocp: OCP) -> tuple[Array, Array]:
+    """A few initial states [ROWS, nx] and parameters [ROWS, np], always the same."""
+    return ocp.initial_states.sample(ROWS, own_numbers(0)), ocp.sample_parameters(ROWS, own_numbers(0, 2))
 
 
 def _errors(ocp: OCP, functions: Functions, s: Solution) -> Callable[[int], float]:
     """substeps -> the largest error."""
     B, K, nx = len(s), s.u.shape[1], s.x.shape[2]
-    x, u, h = s.x[:, :-1].reshape(-1, nx).T, s.u.reshape(B * K, -1).T, np.diff(s.t, axis=1).reshape(1, -1)
-    step = functions.step()
+    x, h = s.x[:, :-1].reshape(-1, nx).T, np.diff(s.t, axis=1).reshape(1, -1)
+    step, moment = functions.step(), _stages(s)
     usual = usual_sizes(ocp)
     cost, slope = np.maximum(np.abs(s.cost), SMALL * usual.cost), s.V_x[:, 1:].reshape(-1, nx).T
     known: dict[int, float] = {}
 
     def after(n: int) -> tuple[Array, Array]:
         z, total = x, np.zeros((1, B * K))
-        for _ in range(n):
-            z, part = (v.full() for v in step(z, u, h / n))
+        for i in range(n):
+            now = {**moment, "x": z.T, "t": moment["t"] + (i * h / n).ravel()}
+            z, part = (v.full() for v in step(*functions.arguments.columns(**now), h / n))
             total = total + part
         return z, total
 
@@ -72,10 +79,18 @@ def _errors(ocp: OCP, functions: Functions, s: Solution) -> Callable[[int], floa
     return error
 
 
-def fastest(functions: Functions, x: Array, u: Array) -> float:
-    """The shortest time constant of the linearised f at states x [n, nx] under controls u [n, nu]; inf for none."""
-    nx = x.shape[1]
-    A = functions.jacobian(x.T, u.T)[0].full()
+def _stages(s: Solution) -> Stages:
+    """The start of each interval of all solutions, a row each: x, u, t, p."""
+    K = s.u.shape[1]
+    p = np.zeros((len(s), 0)) if s.p is None else s.p
+    return {"x": s.x[:, :-1].reshape(-1, s.x.shape[2]), "u": s.u.reshape(len(s) * K, -1), "t": s.t[:, :-1].ravel(),
+            "p": np.repeat(p, K, axis=0)}
+
+
+def fastest(functions: Functions, at: Stages) -> float:
+    """The shortest time constant of the linearised f at stages x [n, nx], u [n, nu], t [n], p [n, np]; inf for none."""
+    nx = at["x"].shape[1]
+    A = functions.jacobian(*functions.arguments.columns(**at))[0].full()
     A = A.reshape(nx, -1, nx).transpose(1, 0, 2)
     rate = np.abs(np.linalg.eigvals(A[np.isfinite(A).all(axis=(1, 2))]).real).max(initial=0.0)
     return float(1 / rate) if rate > 0 else np.inf

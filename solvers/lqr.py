@@ -48,13 +48,17 @@ class _LinearQuadratic:
 class LQR:
     """u(x, t) = clip(u* - K(t) (x - x*), U) on a finite horizon, or with constant K where `infinite`.
 
-    Raises ValueError where the goal pair is no equilibrium of f, no stationary point of L and G, where the Hessian of
-    L in u is not positive definite, and (infinite) where (A, B) is not stabilisable.
+    Of one problem: with parameters, that at given ones, LQR(ocp.at(p=...)).
+
+    Raises ValueError where the problem holds the time or parameters, where the goal pair is no equilibrium of f, no
+    stationary point of L and G, where the Hessian of L in u is not positive definite, and (infinite) where (A, B) is
+    not stabilisable.
     """
 
     def __init__(self, ocp: OCP, infinite: bool = False) -> None:
         checks.problem(ocp, "LQR")
         infinite = checks.flag(infinite, "infinite", "LQR")
+        ocp.refuse_parameters("LQR")
         self.ocp, self.infinite = ocp, infinite
         self.A, self.B = (j.full() for j in ocp.functions.jacobian(ocp.x_goal, ocp.u_goal))
         self.Q, self.R, self.S, self.P_final = _hessians(ocp)

@@ -63,6 +63,7 @@ class RRTStar:
     def __init__(self, ocp: OCP, *, iterations: int | None = None, seconds: float | None = None,
                  tolerance: float = 1e-3, intervals: int = 400, seed: int = 0) -> None:
         checks.problem(ocp, "RRTStar")
+        ocp.refuse_parameters("RRTStar")
         owner = f"RRTStar on {ocp.system.name!r}"
         if (iterations is None) == (seconds is None):
             raise ValueError(f"{owner}: iterations is {iterations!r}, seconds {seconds!r}; expected one of them")

@@ -24,6 +24,7 @@ from scipy.spatial import KDTree
 
 from nocl.data import TINY, Solution, hits
 from nocl.ocp import OCP
+from nocl.sampling import box
 from nocl.scales import usual_sizes
 from nocl.solvers.mirrors import Mirror, mirrored
 from nocl.support.checks import Array
@@ -84,15 +85,17 @@ class Solver(Protocol):
 class Search:
     """The best of all that was tried from each state x0 [B, nx] on the nodes t [K+1].
 
+    p : the parameters of each state's problem [B, np], where there are some: they count in distances as states do
     known : solutions of the same states to begin with; neighbours, rounds : at most, 0 for none
     """
 
     def __init__(self, solver: Solver, ocp: OCP, mirrors: list[Mirror], x0: Array, t: Array, *, neighbours: int,
-                 rounds: int, seed: int, known: Solution | None = None) -> None:
+                 rounds: int, seed: int, known: Solution | None = None, p: Array | None = None) -> None:
         self.solver, self.ocp, self.mirrors, self.x0, self.t = solver, ocp, mirrors, x0, t
         self.neighbours, self.rounds, self.seed = neighbours, rounds, seed
         self.unit = usual_sizes(ocp).cost
-        self.best = Solution.blank(np.tile(t, (len(x0), 1)), x0.shape[1], ocp.system.nu)
+        self.p = np.zeros((len(x0), 0)) if p is None else p
+        self.best = Solution.blank(np.tile(t, (len(x0), 1)), x0.shape[1], ocp.system.nu, self.p)
         self.seconds, self.iterations = np.zeros(len(x0)), np.zeros(len(x0), dtype=np.int64)
         self.owners, self.costs = [np.zeros(0, dtype=np.int64)], [np.zeros(0)]  # of each start: its state, how it ended
         self.near: tuple[Rows, Rows, Array] | None = None  # each state's neighbours: state, image, cost when tried
@@ -124,7 +127,7 @@ class Search:
         if not len(solved):
             return
         if self.neighbours:
-            scale = spread(self.ocp, self.best.x[solved])
+            scale = spread(self.ocp, self.best.x[solved], self.p)
             moves = [*self._near(scale, self.neighbours + MORE * number),
                      *(self._passing(solved, scale) for _ in range(PASSING)),
                      *(self._afar(solved) for _ in range(AFAR))]
@@ -150,7 +153,8 @@ class Search:
         if len(chosen) > NODES:
             chosen = self.rng.choice(len(chosen), NODES, replace=False)
         parent, node = solved[chosen // last], 1 + chosen % last
-        place, image = _nearest(self.best.x[parent, node], scale, self._images(), NEAR)
+        there = np.c_[self.best.x[parent, node], self.p[parent]]
+        place, image = _nearest(there, scale, self._images(), NEAR)
         weight = self.rng.random(place.shape) * (parent[place] != np.arange(B)[:, None])
         pick = (np.arange(B), weight.argmax(axis=1))
         held, rows = self.rng.random(B) < 0.5, np.flatnonzero(weight.max(axis=1) > 0)
@@ -182,7 +186,7 @@ class Search:
         x, u, gain = (1 - share) * s.x[row, between] + share * s.x[row, between + 1], s.u[row, k], s.gain[row, k]
         for i, mirror in enumerate(self.mirrors, 1):
             at = moves.image == i
-            x[at], u[at] = mirrored(self.ocp, mirror, x[at], u[at])
+            x[at], u[at] = mirrored(self.ocp, mirror, x[at], u[at], self.p[moves.parent[at]])
             gain[at] *= mirror[1][:, None] * mirror[0]
         return {"x": x, "u": u, "gain": gain}
 
@@ -190,16 +194,17 @@ class Search:
         return np.clip(np.searchsorted(self.t, times, side="right") - 1, 0, len(self.t) - 2)
 
     def _neighbours(self, scale: Array, count: int) -> tuple[Rows, Rows, Array]:
-        state, image = _nearest(self.x0, scale, self._images(), count + 1)
+        state, image = _nearest(np.c_[self.x0, self.p], scale, self._images(), count + 1)
         own = (state == np.arange(len(self.x0))[:, None]) & (image == 0)
         order = np.argsort(own, axis=1, kind="stable")[:, :-1]  # itself, the nearest, goes last and away
         state, image = (np.take_along_axis(a, order, axis=1) for a in (state, image))
         return state, image, np.full(state.shape, np.nan)
 
     def _images(self) -> list[Array]:
-        """The states, and their mirror images."""
-        u = np.asarray(self.ocp.u_goal)
-        return [self.x0, *(mirrored(self.ocp, mirror, self.x0, u)[0] for mirror in self.mirrors)]
+        """The states with their parameters, and their mirror images."""
+        u = self.ocp.goals(self.p)[1]
+        images = (mirrored(self.ocp, mirror, self.x0, u, self.p)[0] for mirror in self.mirrors)
+        return [np.c_[x, self.p] for x in (self.x0, *images)]
 
     def _take(self, found: Found) -> None:
         """Count all that was tried, and keep what is better."""
@@ -228,14 +233,21 @@ class Search:
 
     def solution(self) -> Solution:
         """The best of each state; seconds, iterations and `tried` are of all starts."""
-        clearance = self.ocp.least(self.best.x).min(axis=1, initial=np.inf)
+        clearance = self.ocp.least(self.best.x, self.t, self.p).min(axis=1, initial=np.inf)
         return replace(self.best, clearance=clearance, seconds=self.seconds, iterations=self.iterations,
                        tried=self._tried(), unit=np.full(len(self.x0), self.unit))
 
 
-def spread(ocp: OCP, x: Array) -> Array:
-    """The states' standard deviations along solutions x [B, K+1, nx], at least 5 % of X: one unit of distance [nx]."""
-    return np.asarray(np.maximum(x.std(axis=(0, 1)), 0.05 * (ocp.system.ubx - ocp.system.lbx)))
+def spread(ocp: OCP, x: Array, p: Array | None = None) -> Array:
+    """The states' standard deviations along solutions x [B, K+1, nx], at least 5 % of X, then those of the parameters
+    p [B, np], at least 5 % of their box: one unit of distance [nx + np].
+    """
+    states = np.maximum(x.std(axis=(0, 1)), 0.05 * (ocp.system.ubx - ocp.system.lbx))
+    if p is None or ocp.parameters is None:
+        return np.asarray(states)
+    low, high = box(ocp.parameters)
+    least = np.where(high > low, 0.05 * (high - low), 1.0)
+    return np.r_[states, np.maximum(p.std(axis=0), least)]
 
 
 def _nearest(points: Array, scale: Array, images: list[Array], count: int) -> tuple[Rows, Rows]:

@@ -24,11 +24,15 @@ def smooth(system: System, K: int, n: int, rng: np.random.Generator) -> Array:
     return size * (system.ubu - system.lbu) / 2 * shape
 
 
-def random_controls(ocp: OCP, K: int, n: int, seed: Seed) -> Array:
-    """n smooth random controls [n, K, nu] in U, about u* or the middle of U, small to full amplitude."""
+def random_controls(ocp: OCP, K: int, n: int, seed: Seed, p: Array | None = None) -> Array:
+    """n smooth random controls [n, K, nu] in U, about u* or the middle of U, small to full amplitude.
+
+    p [n, np], where u* depends on it.
+    """
     s, rng = ocp.system, np.random.default_rng(seed)
     shape = smooth(s, K, n, rng)
-    base = np.where(rng.random((n, 1, 1)) < 0.5, np.asarray(ocp.u_goal), (s.lbu + s.ubu) / 2)
+    goal = ocp.u_goal if p is None else ocp.goals(p)[1][:, None]
+    base = np.where(rng.random((n, 1, 1)) < 0.5, np.asarray(goal), (s.lbu + s.ubu) / 2)
     return np.ascontiguousarray(np.clip(base + shape, s.lbu, s.ubu))
 
 

@@ -23,8 +23,8 @@ def untrained(name, seed=0, loud=1.0):
     s, n = ocp.system, 400
     x, t = ocp.initial_states.sample(n, rng) + 0.3 * rng.standard_normal((n, s.nx)), rng.uniform(0, ocp.horizon, n)
     u = rng.uniform(s.lbu, s.ubu, (n, s.nu))
-    labels = Labels(x, t, u, np.ones(n), np.zeros(n))
-    values = ValueLabels(x, t, rng.uniform(0.1, 2.0, n), rng.standard_normal((n, s.nx)))
+    labels = Labels(x, t, np.zeros((n, 0)), u, np.ones(n), np.zeros(n))
+    values = ValueLabels(x, t, np.zeros((n, 0)), rng.uniform(0.1, 2.0, n), rng.standard_normal((n, s.nx)))
     with torch.random.fork_rng():
         torch.manual_seed(seed)
         policy, _ = policy_net(ocp, labels, SIZES)

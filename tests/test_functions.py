@@ -21,7 +21,7 @@ DOOR = {  # files that may hold the symbols of a system and the expressions of a
     "nocl/ocp.py",  # where L, G and h are
     "nocl/functions.py",  # the door
 }
-SYSTEM = {"x", "u", "xdot"}  # what only they read of a System ...
+SYSTEM = {"x", "u", "p", "xdot"}  # what only they read of a System ...
 OCP = {"running", "terminal"}  # ... and of an OCP
 FUNCTIONS = {"equations", "f", "jacobian", "linearize"}  # of a System: whoever has a problem reads ocp.functions
 
@@ -115,31 +115,31 @@ def test_a_plant_that_is_not_known_has_costs_and_no_f(ocp):
     np.testing.assert_array_equal(of.on(s.f).step(soft=False)(X, U, 0.1)[0], ocp.functions.step()(X, U, 0.1)[0])
 
 
-def test_an_argument_more_is_an_argument_of_everything(ocp, monkeypatch):
-    """What the door gives, and what is built on it elsewhere, follows the system's arguments by itself."""
-    monkeypatch.setattr("nocl.solvers.ddp.kernel.damped", lambda ocp: np.ones(2))  # it evaluates L, for usual costs
+def test_time_and_parameters_are_arguments_of_everything(ocp):
+    """What the door gives, and what is built on it elsewhere, follows the problem's arguments by itself."""
+    a, b, c, t = *map(nocl.parameter, "pqr"), nocl.time()
     s = ocp.system
-    plain = minimiser(ocp), ocp.functions.step()
-    for name in ("f", "jacobian"):
-        s.__dict__.pop(name, None)
-    s.__dict__["arguments"] = s.arguments.given(p=ca.SX.sym("p", 3))
-    of = nocl.OCP(s, horizon=1.0, running=ocp.running, terminal=ocp.terminal, x_goal=[0, 0], u_goal=[0, 0],
-                  initial_states=ocp.initial_states, path_constraints=ocp.path_constraints, penalty=7,
-                  penalty_margin=0.1)
-    program = Transcription(of, of.functions.f, 4)
-    made = {"f": of.functions.f, "L": of.L, "jacobian": of.functions.jacobian, "step": of.functions.step(),
-            "hamiltonian": hamiltonian(of), "minimiser": minimiser(of), "h": of.h, "G": of.G,
-            "program": program.step, "slopes": Derivatives(program).second, "flow": Derivatives(program).flow}
-    first = {"h": ["x", "p"], "G": ["x", "p"], "minimiser": ["x", "p", "costate"]}
+    plant = nocl.System("more", x=s.x, u=s.u, p=a, xdot=s.xdot + a * t * s.x, lbu=s.lbu, ubu=s.ubu, lbx=s.lbx,
+                        ubx=s.ubx)
+    more = nocl.OCP(plant, p=ca.vertcat(b, c), horizon=1.0, running=ocp.running + b * t, terminal=ocp.terminal + c,
+                    x_goal=[0, 0], u_goal=[0, 0], initial_states=ocp.initial_states, penalty=7, penalty_margin=0.1,
+                    path_constraints=ocp.path_constraints, parameters=nocl.Uniform([-1] * 3, [1] * 3))
+    program = Transcription(more, more.functions.f, 4)
+    made = {"f": more.functions.f, "L": more.L, "jacobian": more.functions.jacobian, "step": more.functions.step(),
+            "hamiltonian": hamiltonian(more), "minimiser": minimiser(more), "h": more.h, "G": more.G,
+            "program": program.step, "slopes": Derivatives(program).second, "flow": Derivatives(program).flow,
+            "end": Derivatives(program).end}
+    first = {"h": ["x", "t", "p"], "G": ["x", "p"], "minimiser": ["x", "t", "p", "costate"], "end": ["x", "t", "p"]}
     last = {"step": ["h"], "program": ["h"], "slopes": ["h", "costate"], "hamiltonian": ["costate"],
             "flow": ["costate"]}
     for name, function in made.items():
-        assert function.name_in() == first.get(name, ["x", "u", "p", *last.get(name, [])]), name
-    assert "stage_jacobian(const lane *i0, const lane *i1, const lane *i2, const lane *i3, lane *o0)" in ddp_source(of)
-    zero = np.zeros(3)
-    assert plain[0] is not None
-    np.testing.assert_array_equal(made["minimiser"](X, zero, U)[0], plain[0](X, U)[0])
-    np.testing.assert_array_equal(made["step"](X, U, zero, 0.1)[0], plain[1](X, U, 0.1)[0])
+        assert function.name_in() == first.get(name, ["x", "u", "t", "p", *last.get(name, [])]), name
+    source = ddp_source(more)
+    assert "#define ND 4\n#define TIMED 1\n#define NP 3" in source
+    assert "stage_jacobian(const lane *i0, const lane *i1, const lane *i2, const lane *i3, lane *o0)" in source
+    none = np.zeros(3)  # then it is the problem without them
+    np.testing.assert_array_equal(made["minimiser"](X, 0.3, none, U)[0], minimiser(ocp)(X, U)[0])
+    np.testing.assert_array_equal(made["step"](X, U, 0.3, none, 0.1)[0], ocp.functions.step()(X, U, 0.1)[0])
 
 
 def test_arguments_are_found_by_name(ocp):

@@ -6,6 +6,7 @@ import pytest
 
 import nocl
 from nocl.solvers.cnd.features import features
+from nocl.solvers.cnd.labels import Labels
 from nocl.solvers.ddp.bank import SolutionBank, extend
 from nocl.solvers.ddp.solver import DDP
 from nocl.solvers.lqr import LQR
@@ -64,11 +65,12 @@ def test_where_the_cost_is_not_periodic_nothing_changes():
 def test_features_do_not_tell_images_apart():
     rng = np.random.default_rng(0)
     x, t = rng.uniform(-3, 3, (500, 2)), rng.uniform(0, 3, 500)
+    labels = Labels(x, t, np.zeros((500, 0)), np.zeros((500, 1)), np.ones(500), np.zeros(500))
     for plain in (False, True):
-        phi = features(pendulum(), x, t, plain=plain)
+        phi = features(pendulum(), labels, plain=plain)
         at = phi(x[:9].T, t[None, :9]).full()
         np.testing.assert_allclose(phi((x[:9] + TURN).T, t[None, :9]).full(), at, atol=1e-9)
-        raw = features(pendulum(lambda theta, omega: theta**2 + omega**2), x, t, plain=plain)
+        raw = features(pendulum(lambda theta, omega: theta**2 + omega**2), labels, plain=plain)
         assert raw.numel_out(0) > phi.numel_out(0)
 
 

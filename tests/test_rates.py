@@ -101,7 +101,7 @@ def test_labels_of_other_rates_are_optimal_held_controls():
 def test_the_same_layers_at_every_rate():
     ocp, rng = nocl.load_ocp("pendulum"), np.random.default_rng(0)
     x, t = rng.standard_normal((50, 2)), rng.uniform(0, 3, 50)
-    labels = Labels(x, t, rng.standard_normal((50, 1)), np.ones(50), rng.uniform(0, 0.1, 50))
+    labels = Labels(x, t, np.zeros((50, 0)), rng.standard_normal((50, 1)), np.ones(50), rng.uniform(0, 0.1, 50))
     net, _ = policy_net(ocp, labels, (8,), control_dt=True)
     X, T = torch.from_numpy(x).float(), torch.from_numpy(t).float()[:, None]
     for dt in (0.0, 0.03):

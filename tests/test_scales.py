@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 import nocl
 from nocl.solvers import DDP, LQR, NMPC
 from nocl.solvers.cnd.features import features
+from nocl.solvers.cnd.labels import Labels
 from nocl.solvers.ddp.global_search import equilibria, solve_globally
 
 X0 = np.array([1.5, -0.5])
@@ -106,8 +107,11 @@ def test_what_counts_as_the_same_cost_does_not_depend_on_its_unit():
 def test_features_do_not_depend_on_units(first, second):
     unit, rng = np.array([first, second]), np.random.default_rng(0)
     x, t = rng.normal(X0, [0.5, 0.5], (500, 2)), rng.uniform(0, 4, 500)
-    right, got = (features(ocp, x / u, t, plain=True)((x / u).T, t[None]).full()
-                  for ocp, u in ((problem(), np.ones(2)), (problem(1.0, unit), unit)))
+    def values(ocp, x):
+        labels = Labels(x, t, np.zeros((500, 0)), np.zeros((500, 1)), np.ones(500), np.zeros(500))
+        return features(ocp, labels, plain=True)(x.T, t[None]).full()
+
+    right, got = values(problem(), x), values(problem(1.0, unit), x / unit)
     np.testing.assert_allclose(got, right, rtol=0, atol=1e-6)
 
 

@@ -17,9 +17,11 @@ from nocl.nets import MLP, FeatureNet
 from nocl.solvers import LQR, NMPC
 from nocl.solvers.cnd import TrainSettings
 from nocl.solvers.cnd.features import policy_net
+from nocl.solvers.cnd.in_torch import InTorch
 from nocl.solvers.cnd.labels import (
     SMALL,
     Labels,
+    Problems,
     answered,
     continuous_cost,
     kicked_rollout,
@@ -202,7 +204,7 @@ def test_a_large_gap_is_told_with_what_to_try():
 
 
 def test_the_gap_counts_from_any_time_and_a_policy_that_blows_up_is_infinitely_bad(pendulum):
-    ocp, ddp, bank, f = pendulum
+    ocp, ddp, bank, _ = pendulum
     fine = DDP(ocp, intervals=160)
     tails = refined(fine, tube(ddp, bank, 8, 0.1, np.random.default_rng(2)))
     own = fine.solve(tails.x[:, 0], tails.t[:, 0], u=tails.u)
@@ -216,7 +218,7 @@ def test_the_gap_counts_from_any_time_and_a_policy_that_blows_up_is_infinitely_b
             u = own.u[i, k] + np.einsum("nij,nj->ni", own.gain[i, k], x.numpy() - near)
             return torch.from_numpy(u.clip(ocp.system.lbu, ocp.system.ubu))
 
-        assert gap(ocp, feedback, f, own[i:i + 1]) == pytest.approx(0.0, abs=2e-3)
+        assert gap(feedback, InTorch(ocp), own[i:i + 1]) == pytest.approx(0.0, abs=2e-3)
     assert summary(np.array([np.nan, np.nan, 0.0]), "gap") == {"gap_median": np.inf, "gap_p95": np.inf}
 
 
@@ -231,13 +233,13 @@ def test_value_scores_are_zero_for_the_exact_value():
         return nocl.to_torch(ca.Function("V", [x, t], [x.T @ S @ x]))(X, T)
 
     policy = nocl.to_torch(ca.Function("u", [x, t], [-K @ x]))
-    f, optima = nocl.to_torch(ocp.system.f), {"initial": starts, "tails": starts}
-    row = value_scores(ocp, value, policy, f, optima)
+    optima = {"initial": starts, "tails": starts}
+    row = value_scores(value, policy, InTorch(ocp), optima)
     assert row["tails_error"] < 1e-4
     assert row["tails_degrees"] < 0.1
     assert row["tails_slope_error"] < 1e-4
     assert row["hjb_mean"] < 1e-10
-    twice = value_scores(ocp, lambda X, T: 2 * value(X, T), policy, f, optima)
+    twice = value_scores(lambda X, T: 2 * value(X, T), policy, InTorch(ocp), optima)
     assert twice["initial_error"] == pytest.approx(1.0, abs=1e-3)
     assert twice["initial_slope_error"] == pytest.approx(1.0, abs=1e-3)
     assert twice["hjb_mean"] > 0.1
@@ -316,7 +318,7 @@ def test_labels_stand_at_the_middle_of_each_interval(pendulum):
     ocp, ddp, bank, f = pendulum
     solution = bank.solution[:3]
     unit = 0.3
-    labels, K = Labels.of(solution, f, unit), ddp.intervals
+    labels, K = Labels.of(solution, InTorch(ddp.ocp), unit), ddp.intervals
     assert len(labels) == 3 * K
     h = ocp.horizon / K
     assert labels.t.reshape(3, K) == pytest.approx(np.tile((np.arange(K) + 0.5) * h, (3, 1)))
@@ -330,9 +332,9 @@ def test_labels_stand_at_the_middle_of_each_interval(pendulum):
 
 
 def test_labels_of_what_failed_are_dropped(pendulum):
-    _, ddp, bank, f = pendulum
+    _, ddp, bank, _ = pendulum
     failed = replace(bank.solution[:3], success=np.array([True, False, True]))
-    assert len(Labels.of(failed, f, 1.0)) == 2 * ddp.intervals
+    assert len(Labels.of(failed, InTorch(ddp.ocp), 1.0)) == 2 * ddp.intervals
     assert len(ValueLabels.of([failed, bank.solution[:1]])) * 2 == len(ValueLabels.of([bank.solution[:6]]))
 
 
@@ -351,16 +353,16 @@ def test_tube_labels_are_optimal(pendulum):
 
 def test_the_better_of_two_starts_is_kept(pendulum):
     """A policy that does nothing gives a poor start; the bank's nearest solution saves the label."""
-    ocp, ddp, bank, f = pendulum
+    ocp, ddp, bank, _ = pendulum
 
     def idle(x, t):
         return torch.zeros(len(x), 1, dtype=x.dtype)
 
     x, t0 = bank.solution.x[:5, 10].copy(), bank.solution.t[:5, 10].copy()
-    best = answered(ddp, bank, idle, f, x, t0)
+    best = answered(ddp, bank, idle, InTorch(ocp), Problems(x, t0, np.zeros((5, 0))))
     near = ddp.solve(x, t0, **bank.guess(np.arange(5), t0))
     assert (best.cost <= near.cost * (1 + 1e-4)).all()
-    u = policy_controls(idle, f, x, t0, ocp.horizon, ddp.intervals)
+    u = policy_controls(idle, InTorch(ocp), Problems(x, t0, np.zeros((5, 0))), ddp.intervals)
     assert u.shape == (5, ddp.intervals, 1)
     assert not u.any()
 
@@ -378,25 +380,27 @@ def feedback(ocp, K=(20.0, 6.0)):
 
 
 def test_kicked_rollout(pendulum):
-    ocp, _, _, f = pendulum
+    ocp = pendulum[0]
     policy, x0 = feedback(ocp), np.array([[0.3, 0.0], [0.1, -0.2]])
-    t, x = kicked_rollout(ocp, policy, f, x0, np.zeros(2), np.random.default_rng(0), steps=320)
+    acting = (InTorch(ocp), policy, Problems(x0, np.zeros(2), np.zeros((2, 0))))
+    t, x = kicked_rollout(*acting, np.zeros(2), np.random.default_rng(0), steps=320)
     run = simulate(ocp, nocl.CND(ocp, policy), x0, nodes=321)
     assert t == pytest.approx(run.t)
     assert x == pytest.approx(run.x, abs=0.01)  # held over 320 intervals, half an interval late
-    _, kicked = kicked_rollout(ocp, policy, f, x0, np.array([0.0, 0.1]), np.random.default_rng(0), steps=320)
-    _, again = kicked_rollout(ocp, policy, f, x0, np.array([0.0, 0.1]), np.random.default_rng(0), steps=320)
+    _, kicked = kicked_rollout(*acting, np.array([0.0, 0.1]), np.random.default_rng(0), steps=320)
+    _, again = kicked_rollout(*acting, np.array([0.0, 0.1]), np.random.default_rng(0), steps=320)
     assert np.array_equal(kicked, again)
     assert np.array_equal(kicked[:, 0], x0)
     assert np.abs(kicked - x).max() > 0.01
 
 
 def test_continuous_cost_is_the_judges(pendulum):
-    ocp, _, _, f = pendulum
+    ocp = pendulum[0]
     policy, x0 = feedback(ocp), np.array([[0.2, 0.0], [0.1, -0.2], [-0.15, 0.3]])  # U is not reached: smooth
     run = simulate(ocp, nocl.CND(ocp, policy), x0)
     assert run.saturation.max() == 0
-    assert continuous_cost(ocp, policy, f, x0, 400) == pytest.approx(run.cost, rel=1e-6)
+    cost = continuous_cost(policy, InTorch(ocp), Problems(x0, np.zeros(3), np.zeros((3, 0))), 400)
+    assert cost == pytest.approx(run.cost, rel=1e-6)
 
 
 def loss_parts(u_label):
@@ -404,8 +408,8 @@ def loss_parts(u_label):
     ocp = nocl.load_ocp("pendulum")
     rng = np.random.default_rng(0)
     n = len(u_label)
-    labels = Labels(rng.standard_normal((n, 2)), rng.uniform(0, 3, n), np.array(u_label)[:, None], np.ones(n),
-                    np.zeros(n))
+    labels = Labels(rng.standard_normal((n, 2)), rng.uniform(0, 3, n), np.zeros((n, 0)), np.array(u_label)[:, None],
+                    np.ones(n), np.zeros(n))
     net, inverse = policy_net(ocp, labels, (4,))
     answer = torch.nn.Linear(1, 1)  # stands for the network: whatever the features, it answers `y`
     answer.y = None
@@ -441,10 +445,10 @@ def test_policy_loss_counts_what_costs():
 
 
 def test_value_labels_are_costs_to_go_on_the_fine_grid(pendulum):
-    ocp, ddp, bank, f = pendulum
+    ocp, ddp, bank, _ = pendulum
     fine = DDP(ocp, intervals=160)
     (whole,) = on_fine_grid(fine, bank.solution)
-    found = value_tails(ddp, bank, feedback(ocp), f, initial=3, tails=12, visits=8, width=0.25, kick=0.1,
+    found = value_tails(ddp, bank, feedback(ocp), InTorch(ocp), initial=3, tails=12, visits=8, width=0.25, kick=0.1,
                         rng=np.random.default_rng(0))
     assert (found.t[:3, 0] == 0).all()  # initial states first
     (tails,) = on_fine_grid(fine, found)
@@ -462,7 +466,8 @@ def riccati_labels(n=4000, shift=0.0):
     rng = np.random.default_rng(0)
     t, x = rng.uniform(0, 2, n), rng.standard_normal((n, 2))
     S, _ = lq_value(t)
-    return ValueLabels(x, t, np.einsum("ni,nij,nj->n", x, S, x) + shift, 2 * np.einsum("nij,nj->ni", S, x))
+    V, V_x = np.einsum("ni,nij,nj->n", x, S, x) + shift, 2 * np.einsum("nij,nj->ni", S, x)
+    return ValueLabels(x, t, np.zeros((n, 0)), V, V_x)
 
 
 @pytest.mark.parametrize("shift", [0.0, -3.0])
@@ -488,7 +493,8 @@ def test_value_loss_has_the_right_gradients():
     net = value_net(ocp, labels, (8,)).float()
     exact = nocl.CND(ocp, feedback(ocp), value_net(ocp, labels, (8,)))
     exact.value_net.load_state_dict({k: v.double() for k, v in net.state_dict().items()})
-    own = ValueLabels(labels.x, labels.t, exact.value(labels.x, labels.t), exact.value_gradient(labels.x, labels.t))
+    at = (labels.x, labels.t)
+    own = ValueLabels(*at, labels.p, exact.value(*at), exact.value_gradient(*at))
     rows = torch.arange(50)
     at_own = value_loss(net, own, np.array([0.5, 2.0]))(rows).item()
     assert at_own == pytest.approx(ROUND, rel=1e-3)  # its least value
@@ -501,7 +507,7 @@ def test_the_compiled_value_loss_is_that_of_autograd(name, sizes):
     """In float64, over more rows than fill the lanes, one of them twice, a floor below zero."""
     ocp, rng = nocl.load_ocp(name), np.random.default_rng(3)
     x, t = rng.standard_normal((50, ocp.system.nx)), rng.uniform(0, ocp.horizon, 50)
-    labels = ValueLabels(x, t, rng.standard_normal(50), rng.standard_normal(x.shape))
+    labels = ValueLabels(x, t, np.zeros((50, 0)), rng.standard_normal(50), rng.standard_normal(x.shape))
     torch.manual_seed(0)
     net, rows = value_net(ocp, labels, sizes).double(), torch.tensor([*range(0, 50, 2), 3, 3, *range(1, 20, 3)])
     answers = []
@@ -603,9 +609,9 @@ def test_visited_states_are_kept_in_a_box_that_ends_at_zero(pendulum):
                        initial_states=start)
     ddp = DDP(problem, intervals=10)
     bank = SolutionBank.of(ddp, ddp.solve(start.sample(4, 0)))
-    f, rng = nocl.to_torch(shifted.f), np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     policy = FeatureNet(ca.Function("phi", [s.x, ca.SX.sym("t")], []), [],
                         ca.Function("u", [s.x, ca.SX.sym("t")], [ca.SX(0.0)]))
-    assert len(visited(ddp, bank, policy, f, 8, 0.1, rng)) == 8
+    assert len(visited(ddp, bank, policy, InTorch(problem), 8, 0.1, rng)) == 8
     with pytest.raises(ValueError, match="drives every state far out of the box"):
-        visited(ddp, bank, policy, f, 8, 1e9, rng)
+        visited(ddp, bank, policy, InTorch(problem), 8, 1e9, rng)

@@ -187,6 +187,7 @@ def _about(name: str) -> str:
 def _problem(args: argparse.Namespace) -> tuple[OCP, Path]:
     """The problem and the folder for its output; ValueError before anything is written."""
     ocp = load_ocp(args.problem)
+    ocp.refuse_parameters("the command line")
     name = Path(args.problem).stem if args.problem.endswith(".py") else args.problem
     out = args.out if args.out is not None else Path("runs") / name
     arguments.check_out(out)

@@ -23,6 +23,7 @@ def to_control(system: System, x: ArrayLike | None = None, u: ArrayLike | None =
 
     Held controls, such as NMPC's, go through `held_inputs`.
     """
+    system.refuse_parameters("to_control")
     if (x is None) != (u is None):
         raise ValueError(f"to_control({system.name}): got one of x and u; expected both, or neither")
     if x is not None and u is not None:
@@ -63,6 +64,7 @@ def _statespace(system: System, x: ArrayLike, u: ArrayLike) -> Any:
 
 def to_do_mpc(system: System) -> Any:
     """do-mpc's continuous Model of the system, set up; states and controls under their names."""
+    system.refuse_parameters("to_do_mpc")
     model = package("do_mpc", "do-mpc").model.Model("continuous", "SX")
     x = ca.vertcat(*(model.set_variable("_x", n) for n in system.state_names))
     u = ca.vertcat(*(model.set_variable("_u", n) for n in system.control_names))
@@ -74,6 +76,7 @@ def to_do_mpc(system: System) -> Any:
 
 def to_acados(system: System) -> Any:
     """acados' AcadosModel of the system: x, u, xdot, explicit and implicit equations, in SX."""
+    system.refuse_parameters("to_acados")
     try:
         model = package("acados_template").AcadosModel()
     except ValueError as error:
@@ -95,6 +98,7 @@ def to_gymnasium(ocp: OCP, *, steps: int = 80, integrator: str = "rk4", observe_
     constraint at the state. integrator: "rk4", the discretisation of NMPC, or "cvodes", the judge's. Path constraints
     are reported, and not in the reward.
     """
+    ocp.refuse_parameters("to_gymnasium")
     if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
         raise ValueError(f"to_gymnasium: steps is {steps!r}; expected an integer >= 1")
     if integrator not in ("rk4", "cvodes"):

@@ -256,10 +256,12 @@ def symbols(value: Any, name: str, owner: str) -> list[ca.SX]:
     return parts
 
 
-def expression(value: Any, rows: int, allowed: ca.SX, name: str, owner: str, controls: ca.SX | None = None) -> ca.SX:
+def expression(value: Any, rows: int, allowed: ca.SX, name: str, owner: str, controls: ca.SX | None = None,
+               time: ca.SX | None = None) -> ca.SX:
     """A dense SX column of `rows` entries in the allowed symbols only; raises ValueError otherwise.
 
     `controls` are symbols that a user might well put there although they are not allowed: the error explains it.
+    `time` is the symbol of time, which is allowed where it is given.
     """
     if isinstance(value, (numbers.Real, ca.DM)):
         value = ca.SX(value if isinstance(value, ca.DM) else float(value))
@@ -269,7 +271,8 @@ def expression(value: Any, rows: int, allowed: ca.SX, name: str, owner: str, con
     if value.shape != (rows, 1):
         raise ValueError(f"{owner}: {name} has shape {value.shape}, expected ({rows}, 1): "
                          f"{'one row per state, by ca.vertcat(...)' if rows > 1 else 'a scalar expression'}")
-    free = [s for s in ca.symvar(value) if not ca.depends_on(s, allowed)]
+    own = allowed if time is None else ca.vertcat(allowed, time)
+    free = [s for s in ca.symvar(value) if not ca.depends_on(s, own)]
     used = [s.name() for s in free if controls is not None and ca.depends_on(s, controls)]
     if used:
         raise ValueError(f"{owner}: {name} contains the control(s) {', '.join(used)}, expected the states only: bound "
@@ -279,7 +282,8 @@ def expression(value: Any, rows: int, allowed: ca.SX, name: str, owner: str, con
         known = ", ".join(s.name() for s in ca.symvar(allowed))
         raise ValueError(f"{owner}: {name} contains the symbol(s) {names}, expected only the system's own ({known}): "
                          f"put a number in their place, or use the very symbols given to the System, not new "
-                         f"ones of the same name")
+                         f"ones of the same name; a parameter is declared, System(..., p=) or OCP(..., p=), and time "
+                         f"is nocl.time()")
     return FrozenSX(ca.densify(value))
 
 

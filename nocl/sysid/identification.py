@@ -77,8 +77,9 @@ class LearnedDynamics:
         return self.net(x, u)
 
     def to_casadi(self) -> ca.Function:
-        """f:(x, u)->(xdot), native MX, equal to torch to rounding."""
-        return to_casadi(self.net, name="f", in_names=["x", "u"], out_names=["xdot"])
+        """f:(x, u)->(xdot), native MX, equal to torch to rounding; with t and p, where the network has them."""
+        names = self.system.arguments.names[:self.net.inputs.n_in()]
+        return to_casadi(self.net, name="f", in_names=names, out_names=["xdot"])
 
     def export_parts(self) -> list[ExportPart]:
         """What nocl.exports.bundle.export writes: f_theta."""
@@ -292,6 +293,7 @@ def _check_arguments(system: System, method: str, gradients: bool,
                      settings: Settings | PaperSettings | LogSettings | None, seed: int,
                      data: Dataset | Log | None) -> Settings | PaperSettings | LogSettings:
     checks.instance(System, system, "system", "identify", "of an OCP, pass ocp.system")
+    system.refuse_parameters("identify")
     checks.word(method, RECIPES, "method", "identify")
     checks.whole(seed, "seed", "identify", most=2**62)
     checks.flag(gradients, "gradients", "identify")

@@ -6,6 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 import casadi as ca
+import numpy as np
+
+from nocl.support.checks import Array
 
 
 class Arguments:
@@ -54,6 +57,13 @@ class Arguments:
         inputs = {**self.symbols, **more}
         return ca.Function(name, list(inputs.values()), list(outputs.values()), list(inputs), list(outputs))
 
+    def columns(self, **values: Any) -> list[Array]:
+        """Values for these in their order, as CasADi has them, columns [n, B]; values of other names are left out.
+
+        values : rows [B, n] by name, or [n] for all rows; of a scalar [B], or a number for all
+        """
+        return [_column(values[name], symbol.numel()) for name, symbol in self.symbols.items()]
+
     def call(self, function: ca.Function) -> Any:
         """The function at those of these that it takes, by its own names of them.
 
@@ -64,3 +74,8 @@ class Arguments:
             raise ValueError(f"{function.name()} takes {', '.join(unknown)}; expected some of {', '.join(self.names)}: "
                              "give it these names, or values for the others by `given`")
         return function(*(self.symbols[name] for name in function.name_in()))
+
+
+def _column(value: Any, size: int) -> Array:
+    array = np.asarray(value, dtype=np.float64)
+    return array.T if array.ndim == 2 else array.reshape(size, -1)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 Field = Callable[[Any, Any], Any]  # (x, u) -> xdot, torch or CasADi
+Moment = Callable[..., Any]  # ... or (x, u, t) -> xdot
 
 
 def rk4(f: Field, x: Any, u: Any, h: Any) -> Any:
@@ -24,17 +25,22 @@ def rk4_interval(f: Field, x: Any, u: Any, h: Any, substeps: int = 1) -> Any:
     return x
 
 
-def rk4_cost(f: Field, L: Field, x: Any, u: Any, h: Any, substeps: int = 1) -> tuple[Any, Any]:
-    """(the state after an interval, the integral of L over it): the same RK4 stages quadrate the cost."""
+def rk4_cost(f: Moment, L: Moment, x: Any, u: Any, h: Any, substeps: int = 1, t: Any = None) -> tuple[Any, Any]:
+    """(the state after an interval, the integral of L over it): the same RK4 stages quadrate the cost.
+
+    t : the time at its start, where f and L are functions of (x, u, t)
+    """
     cost = 0
     h = h / substeps
-    for _ in range(substeps):
-        k1 = f(x, u)
+    for part in range(substeps):
+        begin, middle, end = ([] if t is None else [t + (part + share) * h] for share in (0, 0.5, 1))
+        k1 = f(x, u, *begin)
         x2 = x + h / 2 * k1
-        k2 = f(x2, u)
+        k2 = f(x2, u, *middle)
         x3 = x + h / 2 * k2
-        k3 = f(x3, u)
+        k3 = f(x3, u, *middle)
         x4 = x + h * k3
-        cost = cost + h / 6 * (L(x, u) + 2 * L(x2, u) + 2 * L(x3, u) + L(x4, u))
-        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + f(x4, u))
+        L1, L2, L3, L4 = L(x, u, *begin), L(x2, u, *middle), L(x3, u, *middle), L(x4, u, *end)
+        cost = cost + h / 6 * (L1 + 2 * L2 + 2 * L3 + L4)
+        x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + f(x4, u, *end))
     return x, cost

@@ -1,10 +1,14 @@
-"""The trained controller u = pi(x, t) and value V(x, t): numpy in and out, CasADi and C out, files in and out."""
+"""The trained controller u = pi(x, t) and value V(x, t): numpy in and out, CasADi and C out, files in and out.
+
+Of a problem with parameters they are pi(x, t, p) and V(x, t, p), in all of these.
+"""
 
 from __future__ import annotations
 
 import copy
 import os
 from collections.abc import Mapping, Sequence
+from functools import cached_property
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -13,6 +17,7 @@ import casadi as ca
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
+from torch import Tensor
 
 from nocl import records
 from nocl.exports.bundle import export
@@ -21,7 +26,7 @@ from nocl.exports.parity import Certificate, ExportPart
 from nocl.judge import dynamics_function
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
-from nocl.solvers.cnd.features import at_rate
+from nocl.solvers.cnd.features import at_rate, folded
 from nocl.solvers.cnd.labels import LONGEST
 from nocl.solvers.cnd.unwrapped import Unwrapped
 from nocl.support import checks
@@ -40,9 +45,9 @@ class CND:
     Parameters
     ----------
     ocp : OCP
-    policy : FeatureNet (x, t) -> u, or (x, t, dt) -> u
+    policy : FeatureNet (x, t[, p]) -> u, or (x, t[, p], dt) -> u
         With dt it is optimal in continuous time at dt = 0, and held for dt at others: see `at_rate`.
-    value : FeatureNet (x, t) -> V, optional
+    value : FeatureNet (x, t[, p]) -> V, optional
     card : mapping
         How it was made and how it scored: plain JSON data.
     """
@@ -57,16 +62,28 @@ class CND:
             checks.instance(Mapping, card, "card", "CND", "plain data")
         self.ocp, self.card = ocp, dict(card or {})
         policy.double().eval().requires_grad_(False)
-        self._at_rates = policy if policy.inputs.n_in() == 3 else None
+        self._at_rates = policy if "dt" in policy.inputs.name_in() else None
         self.policy = policy if self._at_rates is None else at_rate(policy, 0.0)
         self.value_net = None if value is None else value.double().eval().requires_grad_(False)
 
-    def __call__(self, x: ArrayLike, t: ArrayLike = 0.0) -> Array:
-        """u [nu] at a state [nx], or [B, nu] at [B, nx], and a time (one for all, or [B])."""
+    def __call__(self, x: ArrayLike, t: ArrayLike = 0.0, p: Any = None) -> Array:
+        """u [nu] at a state [nx], or [B, nu] at [B, nx], and a time (one for all, or [B]).
+
+        p : parameters, where the problem has them: [np] for all, [B, np], or by name (OCP.parameters_of)
+        """
         rows, single = self._states(x)
         with torch.no_grad():
-            u = self.policy(*self._tensors(rows, t)).numpy()
+            u = self.policy(*self._tensors(rows, t, p)).numpy()
         return u[0] if single else u
+
+    def at(self, p: Any) -> CND:
+        """The controller u(x, t) at given parameters, [np] or by name, folded in as constants, of `ocp.at(p)`."""
+        value, ocp = self.ocp.parameters_of(p, 1, "CND.at")[0], self.ocp.at(p)
+        if not self.ocp.np:
+            return self
+        policy = folded(self._at_rates or self.policy, p=value)
+        V = None if self.value_net is None else folded(self.value_net, p=value)
+        return CND(ocp, policy, V, self.card | {"p": dict(zip(self.ocp.parameter_names, value.tolist(), strict=True))})
 
     @property
     def continuous_angles(self) -> tuple[str, ...]:
@@ -79,7 +96,8 @@ class CND:
         return Unwrapped(self, self.ocp)
 
     def unwrapped_to_casadi(self) -> ca.Function:
-        """unwrapped:(x [nx], t, last [nx]) -> (u [nu], continuous [nx]); `continuous` is the next call's `last`."""
+        """unwrapped:(x [nx], t[, p], last [nx]) -> (u [nu], continuous [nx]); `continuous` is the next call's `last`.
+        """
         pi, s = self.to_casadi(), self.ocp.system
         at, last = Arguments.of(pi), ca.MX.sym("last", s.nx)
         x, turn = at["x"], 2 * np.pi
@@ -102,19 +120,28 @@ class CND:
         checks.between(dt, 0.0, longest * (1 + 1e-9), "dt", "CND.at_rate", f", the horizon over {LONGEST}, as trained")
         return CND(self.ocp, at_rate(self._at_rates, float(dt)), self.value_net, self.card | {"dt": float(dt)})
 
-    def value(self, x: ArrayLike, t: ArrayLike = 0.0) -> Array:
-        """V(x, t), the cost-to-go: a number at [nx], or [B] at [B, nx]."""
+    def value(self, x: ArrayLike, t: ArrayLike = 0.0, p: Any = None) -> Array:
+        """V(x, t[, p]), the cost-to-go: a number at [nx], or [B] at [B, nx]."""
         rows, single = self._states(x)
         with torch.no_grad():
-            V = self._value_net()(*self._tensors(rows, t)).numpy()[:, 0]
+            V = self._value_net()(*self._tensors(rows, t, p)).numpy()[:, 0]
         return V[0] if single else V
 
-    def value_gradient(self, x: ArrayLike, t: ArrayLike = 0.0) -> Array:
+    def value_gradient(self, x: ArrayLike, t: ArrayLike = 0.0, p: Any = None) -> Array:
         """dV/dx, the costate: [nx] at [nx], or [B, nx] at [B, nx]."""
+        return self._value_slope(0, x, t, p)
+
+    def value_gradient_by_p(self, x: ArrayLike, t: ArrayLike, p: Any) -> Array:
+        """dV/dp: [np] at [nx], or [B, np] at [B, nx]; ValueError where the problem has no parameters."""
+        if not self.ocp.np:
+            raise ValueError(f"the problem on {self.ocp.system.name!r} has no parameters, so V has no gradient by them")
+        return self._value_slope(2, x, t, p)
+
+    def _value_slope(self, argument: int, x: ArrayLike, t: ArrayLike, p: Any) -> Array:
         rows, single = self._states(x)
-        states, times = self._tensors(rows, t)
-        states.requires_grad_(True)
-        (gradient,) = torch.autograd.grad(self._value_net()(states, times).sum(), states)
+        given = self._tensors(rows, t, p)
+        given[argument].requires_grad_(True)
+        (gradient,) = torch.autograd.grad(self._value_net()(*given).sum(), given[argument])
         return gradient[0].numpy() if single else gradient.numpy()
 
     def to_casadi(self, backend: str = "native", build_dir: Build = None) -> ca.Function:
@@ -139,11 +166,11 @@ class CND:
 
     def closed_loop_to_casadi(self, dynamics: Any = None, backend: str = "native",
                               build_dir: Build = None) -> ca.Function:
-        """closed_loop:(x [nx], t) -> (xdot [nx]), xdot = f(x, pi(x, t)).
+        """closed_loop:(x [nx], t[, p]) -> (xdot [nx]), xdot = f(x, pi(x, t)).
 
         dynamics: another f than the exact one, a casadi.Function (x, u) -> xdot or an object with `to_casadi()`.
         """
-        pi, f = self.to_casadi(backend, build_dir), dynamics_function(self.ocp, dynamics)
+        pi, f = self.to_casadi(backend, build_dir), self.ocp.functions.on(dynamics_function(self.ocp, dynamics)).f
         at = Arguments.of(pi)
         return at.function("closed_loop", {"xdot": ca.densify(at.given(u=at.call(pi)).call(f))})
 
@@ -151,19 +178,20 @@ class CND:
         """What is exported: policy, gain and closed loop, and value and value gradient where it has a value."""
         s, policy, value = self.ocp.system, self.policy, self.value_net
         box = {"x": (s.lbx, s.ubx), "t": (0.0, self.ocp.horizon)}
-        x, u = ({"x": [s.unit(n) for n in s.state_names]}, [s.unit(n) for n in s.control_names])
+        x, u = {"x": [s.unit(n) for n in s.state_names]}, [s.unit(n) for n in s.control_names]
+        if self.ocp.np:
+            box["p"], x["p"] = self.ocp.parameter_box, [self.ocp.unit(n) for n in self.ocp.parameter_names]
         slopes = [f"d {i} / d {j}" for i in s.control_names for j in s.state_names]
         made = [ExportPart("policy", self.to_casadi(), policy, box | {"u": (s.lbu, s.ubu)}, x | {"u": u}, policy),
-                ExportPart("gain", self.gain_to_casadi(), lambda x, t: _slopes(policy, x, t), box, x | {"K": slopes},
+                ExportPart("gain", self.gain_to_casadi(), lambda *at: _slopes(policy, *at), box, x | {"K": slopes},
                            lean=_lean(self.to_casadi(), "gain", "K"))]
         if s.xdot is not None:  # a plant that is not known has no closed loop to write down
-            f = to_torch(self.ocp.functions.f)
-            made.append(ExportPart("closed_loop", self.closed_loop_to_casadi(), lambda x, t: f(x, policy(x, t)), box,
+            made.append(ExportPart("closed_loop", self.closed_loop_to_casadi(), self._closed_loop, box,
                                    x | {"xdot": [f"d {i} / dt" for i in s.state_names]}))
         if value is not None:
             made += [ExportPart("value", self.value_to_casadi(), value, box, x | {"V": ["cost-to-go"]}, value),
                      ExportPart("value_gradient", self.value_gradient_to_casadi(),
-                                lambda x, t: _slopes(value, x, t), box,
+                                lambda *at: _slopes(value, *at), box,
                                 x | {"V_x": [f"d V / d {i}" for i in s.state_names]},
                                 lean=_lean(self.value_to_casadi(), "value_gradient", "V_x"))]
         return made
@@ -221,12 +249,23 @@ class CND:
     def _states(self, x: ArrayLike) -> tuple[Array, bool]:
         return checks.states(x, self.ocp.system.nx, self.ocp.system.name, "x")
 
-    def _tensors(self, rows: Array, t: ArrayLike) -> tuple[torch.Tensor, torch.Tensor]:
+    def _closed_loop(self, x: Tensor, t: Tensor, *p: Tensor) -> Tensor:
+        at = {"x": x, "u": self.policy(x, t, *p), "t": t, "p": p[0] if p else None}
+        return self._f(*(at[name] for name in self.ocp.functions.arguments.names))
+
+    @cached_property
+    def _f(self) -> Any:
+        """f in torch."""
+        return to_torch(self.ocp.functions.f)
+
+    def _tensors(self, rows: Array, t: ArrayLike, p: Any) -> tuple[Tensor, ...]:
         times = checks.numeric(t, "t", self.ocp.system.name, f"one time or {len(rows)}")
         if times.shape not in ((), (len(rows),)) or not ((times >= 0) & (times <= self.ocp.horizon * (1 + 1e-9))).all():
             raise ValueError(f"t is {np.array2string(times, threshold=4)}; expected one time or {len(rows)}, "
                              f"each in [0, {self.ocp.horizon:g}]")
-        return torch.from_numpy(rows.copy()), torch.from_numpy(np.broadcast_to(times, len(rows)).copy())[:, None]
+        values = self.ocp.parameters_of(p, len(rows), f"CND on {self.ocp.system.name!r}")
+        given = [rows.copy(), np.broadcast_to(times, len(rows)).copy()[:, None], *([values] if self.ocp.np else [])]
+        return tuple(torch.from_numpy(value) for value in given)
 
     def _value_net(self) -> FeatureNet:
         if self.value_net is None:
@@ -237,14 +276,14 @@ class CND:
     def _export(self, net: FeatureNet, name: str, out: str, backend: str, build_dir: Build) -> ca.Function:
         place = None if build_dir is None else checks.folder(build_dir, "build_dir", name)
         return to_casadi(net, backend=backend, name=name, build_dir=place,
-                         in_names=["x", "t"], out_names=[out])
+                         in_names=self.ocp.functions.feedback().names, out_names=[out])
 
 
-def _slopes(net: FeatureNet, x: torch.Tensor, t: torch.Tensor) -> torch.Tensor:
+def _slopes(net: FeatureNet, x: Tensor, *more: Tensor) -> Tensor:
     """d net / dx [B, n_out * nx], row by row, differentiable."""
     with torch.enable_grad():
         x = x if x.requires_grad else x.detach().requires_grad_(True)
-        y = net(x, t)
+        y = net(x, *more)
         return torch.cat([torch.autograd.grad(y[:, i].sum(), x, create_graph=True)[0] for i in range(y.shape[1])], 1)
 
 
@@ -267,7 +306,7 @@ def _smallest(net: FeatureNet) -> FeatureNet:
 
 def _check_sizes(ocp: OCP, nets: Mapping[str, FeatureNet]) -> None:
     """ValueError where a file's networks do not fit its own problem."""
-    n, s = [ocp.system.nx, 1], ocp.system
+    n, s = [ocp.system.nx, 1, *([ocp.np] if ocp.np else [])], ocp.system
     for name, outputs in (("policy", s.nu), ("value", 1)):
         if name not in nets:
             continue

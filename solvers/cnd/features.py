@@ -3,12 +3,13 @@
 Features of (x, t): the state in units of its spread at that time about its mean at that time (both polynomials in t),
 sine and cosine of angles, time, the logarithm of the time to go, and the distance to the goal over the time to go: the
 optimal gain grows like 1 / (T - t). Of an angle that the problem is periodic in nothing but sines and cosines is seen,
-so that all images of a state have one answer.
+so that all images of a state have one answer. With parameters, (x, t, p): p itself, the distance to the goal that
+depends on p in the same units as the state, and the path constraints, which tell where obstacles are.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import casadi as ca
 import numpy as np
@@ -25,39 +26,78 @@ if TYPE_CHECKING:
 DEGREE = 6  # of the polynomials in time
 CONSTANT = 1e-6  # of its usual size: what varies less is as good as constant
 LEAST_TIME = 0.025  # of the horizon: time to go is never counted as less
+Part = tuple[ca.SX, Array | float]  # features [k], and the usual size of each
 
 
-def features(ocp: OCP, x: Array, t: Array, dt: Array | None = None, *, plain: bool = False) -> ca.Function:
-    """(x, t) -> phi, each feature with mean 0 and standard deviation 1 over the labels x [n, nx], t [n].
+class Places(Protocol):
+    """Where labels are: x [n, nx], t [n], p [n, np]."""
 
-    With dt [n] it is (x, t, dt) -> phi: the clock then stands at the middle of the time that a control is held for.
-    `plain` adds the state in units that do not change with time.
+    @property
+    def x(self) -> Array: ...
+    @property
+    def t(self) -> Array: ...
+    @property
+    def p(self) -> Array: ...
+
+
+def features(ocp: OCP, labels: Places, dt: Array | None = None, *, plain: bool = False) -> ca.Function:
+    """(x, t[, p]) -> phi, each feature with mean 0 and standard deviation 1 over the labels' x, t, p.
+
+    With dt [n] it is (x, t[, p], dt) -> phi: the clock then stands at the middle of the time that a control is held
+    for. `plain` adds the state in units that do not change with time.
     """
-    s, at = ocp.system, ocp.functions.feedback()
+    s, at, (x, t) = ocp.system, ocp.functions.feedback(), (labels.x, labels.t)
     if dt is not None:
         at = at.given(dt=ca.SX.sym("dt"))
     state, time = at["x"], at["t"] if dt is None else at["t"] + at["dt"] / 2
-    tau = 2 * time / ocp.horizon - 1
+    tau, moment = 2 * time / ocp.horizon - 1, 2 * (t if dt is None else t + dt / 2) / ocp.horizon - 1
     to_go = ca.fmax(ocp.horizon - time, 0)
     half = usual_sizes(ocp).x
-    mean, spread = _moments_in_time(x, 2 * (t if dt is None else t + dt / 2) / ocp.horizon - 1, half)
-    standard = (state - _polynomial(mean, tau)) / ca.exp(_polynomial(spread, tau))
     once = [i for i in range(s.nx) if i not in ocp.periodic]  # the others have many images: sines and cosines only
     angles = [g(state[i]) for i in s.angle_indices for g in (ca.sin, ca.cos)]
-    off = state - ca.DM(ocp.x_goal)
+    off = state - (ocp.goal(at["p"])[0] if ocp.goal_varies else ca.DM(ocp.x_goal))
     left = ca.vertcat(*(ca.sin(off[i]) if i in ocp.periodic else off[i] for i in range(s.nx)))
     rush = left / (to_go + LEAST_TIME * ocp.horizon)
     clock = ca.vertcat(tau, ca.log(to_go / ocp.horizon + LEAST_TIME) / 2)
-    more = [state[once]] if plain else []
-    raw = ca.vertcat(standard[once], *angles, clock, rush, *more, *([] if dt is None else [at["dt"]]))
-    given = [x, t] if dt is None else [x, t, dt]
+    parts: list[Part] = [(_standard(state, x, tau, moment, half)[once], 1.0), (ca.vertcat(*angles, clock), 1.0),
+                         (rush, np.array([1.0 if i in ocp.periodic else half[i] for i in range(s.nx)])),
+                         *([(state[once], half[once])] if plain else []),
+                         *_of_parameters(ocp, at, off, labels, tau, moment),
+                         *([] if dt is None else [(at["dt"], ocp.horizon)])]
+    raw = ca.vertcat(*(e for e, _ in parts))
+    usual = np.concatenate([np.broadcast_to(size, e.numel()) for e, size in parts])
+    given = at.columns(x=x, t=t, p=labels.p, dt=dt)
     some = slice(None, None, -(-len(t) // 20_000))  # of every kind of label
-    values = at.function("raw", {"raw": raw})(*(np.atleast_2d(a[some].T) for a in given)).full()
-    rates = [1.0 if i in ocp.periodic else half[i] for i in range(s.nx)]
-    one = np.r_[np.ones(len(once) + len(angles) + clock.numel()), rates, half[once] if plain else [],
-                [] if dt is None else [ocp.horizon]]
-    centre, width = values.mean(axis=1), values.std(axis=1) + CONSTANT * one
+    values = at.function("raw", {"raw": raw})(*(a[:, some] for a in given)).full()
+    centre, width = values.mean(axis=1), values.std(axis=1) + CONSTANT * usual
     return at.function("features", {"phi": (raw - ca.DM(centre)) / ca.DM(width)})
+
+
+def _standard(e: ca.SX, values: Array, tau: ca.SX, moment: Array, half: Array) -> ca.SX:
+    """e [k] about its mean at the time, in units of its spread then, over values [n, k] at times tau = moment [n].
+
+    half : usual sizes of e [k]
+    """
+    mean, spread = _moments_in_time(values, moment, half)
+    return (e - _polynomial(mean, tau)) / ca.exp(_polynomial(spread, tau))
+
+
+def _of_parameters(ocp: OCP, at: Arguments, off: ca.SX, labels: Places, tau: ca.SX,
+                   moment: Array) -> list[Part]:
+    """The features that a problem with parameters has beside those of its state."""
+    if not ocp.np:
+        return []
+    low, high = ocp.parameter_box
+    moves = [i for i in range(ocp.system.nx) if ocp.goal_varies and ca.depends_on(off[i], at["p"])]
+    turning, plain = ([i for i in moves if (i in ocp.periodic) == periodic] for periodic in (True, False))
+    parts: list[Part] = [(at["p"], np.where(high > low, (high - low) / 2, 1.0)),
+                         *((g(off[i]), 1.0) for i in turning for g in (ca.sin, ca.cos))]
+    if plain:
+        away, half = ocp.from_goal(labels.x, labels.p)[:, plain], usual_sizes(ocp).x[plain]
+        parts.append((_standard(off[plain], away, tau, moment, half), 1.0))
+    if ocp.path_constraints:
+        parts.append((at.but("dt").call(ocp.functions.h), ocp.constraint_scales))
+    return parts
 
 
 def _moments_in_time(x: Array, tau: Array, half: Array) -> tuple[Array, Array]:
@@ -86,10 +126,10 @@ def policy_net(ocp: OCP, labels: Labels, sizes: tuple[int, ...],
                control_dt: bool = False) -> tuple[FeatureNet, ca.Function]:
     """(u = clip(mean + spread * y, U), y a tanh network of the features; and u -> y, its inverse inside U).
 
-    control_dt: (x, t, dt) -> u in place of (x, t) -> u.
+    control_dt: (x, t[, p], dt) -> u in place of (x, t[, p]) -> u.
     """
     s = ocp.system
-    phi = features(ocp, labels.x, labels.t, labels.dt if control_dt else None)
+    phi = features(ocp, labels, labels.dt if control_dt else None)
     mean, spread = ca.DM(labels.u.mean(axis=0)), ca.DM(labels.u.std(axis=0) + 1e-9 * usual_sizes(ocp).u)
     y, u = ca.SX.sym("y", s.nu), ca.SX.sym("u", s.nu)
     clipped = ca.fmin(ca.fmax(mean + spread * y, ca.DM(s.lbu)), ca.DM(s.ubu))
@@ -99,8 +139,14 @@ def policy_net(ocp: OCP, labels: Labels, sizes: tuple[int, ...],
 
 
 def at_rate(net: FeatureNet, dt: float) -> FeatureNet:
-    """(x, t) -> u of a network (x, t, dt) -> u at one dt; the layers are shared."""
-    at = Arguments.of(net.outputs).but("dt")
-    phi = at.but("y").function("features", {"phi": at.given(dt=dt).call(net.inputs)})
-    outputs = at.function("controls", {"u": at.given(dt=dt).call(net.outputs)})
+    """(x, t[, p]) -> u of a network (x, t[, p], dt) -> u at one dt; the layers are shared."""
+    return folded(net, dt=dt)
+
+
+def folded(net: FeatureNet, **values: Any) -> FeatureNet:
+    """A network with some of its arguments, by name, at constant values; the layers are shared."""
+    at, out = Arguments.of(net.outputs).but(*values), net.outputs.name_out()[0]
+    given = at.given(**{name: ca.SX(ca.DM(value)) for name, value in values.items()})
+    phi = at.but("y").function("features", {"phi": given.call(net.inputs)})
+    outputs = at.function(net.outputs.name(), {out: given.call(net.outputs)})
     return FeatureNet(phi, [cast(MLP, layers) for layers in net.nets], outputs)

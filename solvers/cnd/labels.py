@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -13,13 +13,13 @@ from torch import Tensor
 
 from nocl.data import Solution
 from nocl.ocp import OCP
+from nocl.solvers.cnd.in_torch import InTorch
 from nocl.solvers.ddp.bank import SolutionBank, better
 from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
-from nocl.translate.rk4 import rk4, rk4_interval
-from nocl.translate.torch_functions import to_torch
+from nocl.translate.rk4 import rk4
 
-Field = Callable[[Tensor, Tensor], Tensor]
+Policy = Callable[..., Tensor]  # (x, t[, p]) -> u
 SMALL = 0.1  # of a usual cost: what is added to costs before anything is divided by them
 COARSE = (2, 5, 10, 20, 40, 160, 640)  # intervals of tails that are solved for other control rates than the labels'
 LONGEST = 40  # a control is held for the horizon over LONGEST at most
@@ -31,6 +31,7 @@ class Labels:
 
     x: Array  # [n, nx]
     t: Array  # [n]
+    p: Array  # [n, np]
     u: Array  # [n, nu]
     weight: Array  # [n], the length of the interval over the cost from the solution's start: relative costs count
     dt: Array  # [n]
@@ -51,20 +52,21 @@ class Labels:
         K, nu = s.u.shape[1:]
         h = np.repeat(np.diff(s.t[:, :2], axis=1), K)
         cost = np.repeat(np.abs(s.V[:, 0]), K) + SMALL * unit
-        return Labels(s.x[:, :-1].reshape(len(h), -1), s.t[:, :-1].ravel(), s.u.reshape(-1, nu), h / cost, h)
+        return Labels(s.x[:, :-1].reshape(len(h), -1), s.t[:, :-1].ravel(), np.repeat(s.parameters, K, axis=0),
+                      s.u.reshape(-1, nu), h / cost, h)
 
     @staticmethod
-    def of(solution: Solution, f: Field, unit: float, substeps: int = 1) -> Labels:
+    def of(solution: Solution, torch_ocp: InTorch, unit: float, substeps: int = 1) -> Labels:
         """The same as continuous controls: at the middle of its interval a held one equals them to second order.
 
         f in torch gives the states between nodes, by half of the interval's `substeps`, or one more.
         """
         start = Labels.held(solution, unit)
         with torch.no_grad():
-            half = torch.from_numpy(start.dt / 2)[:, None]
-            at = (torch.from_numpy(start.x), torch.from_numpy(start.u), half)
-            middle = rk4_interval(f, *at, (substeps + 1) // 2).numpy()
-        return Labels(middle, start.t + start.dt / 2, start.u, start.weight, np.zeros(len(start)))
+            half, t = torch.from_numpy(start.dt / 2)[:, None], torch.from_numpy(start.t)[:, None]
+            at = (torch.from_numpy(start.x), torch.from_numpy(start.u), t, half)
+            middle = torch_ocp.at(start.p).after(*at, (substeps + 1) // 2).numpy()
+        return replace(start, x=middle, t=start.t + start.dt / 2, dt=np.zeros(len(start)))
 
     @staticmethod
     def join(parts: list[Labels]) -> Labels:
@@ -83,101 +85,129 @@ def at_other_rates(ddp: DDP, solution: Solution, unit: float, rng: np.random.Gen
         nearest = ((np.arange(N) + 0.5) * K / N).astype(int)
         other = copy.copy(ddp)  # the same compiled kernel
         other.intervals = N
-        parts.append(Labels.held(other.solve(done.x[rows, 0], done.t[rows, 0], u=done.u[rows][:, nearest]), unit))
+        solved = other.solve(done.x[rows, 0], done.t[rows, 0], u=done.u[rows][:, nearest], p=done[rows].p)
+        parts.append(Labels.held(solved, unit))
     return Labels.join(parts)
 
 
 def tube(ddp: DDP, bank: SolutionBank, n: int, width: float, rng: np.random.Generator) -> Solution:
     """Tails from n random states near the bank's trajectories, each from the solution it is near."""
-    rows, t0, x = tube_states(bank, n, width, ddp.ocp.horizon, rng)
-    return ddp.solve(x, t0, **bank.guess(rows, t0, x))
+    rows, problems = tube_states(ddp.ocp, bank, n, width, rng)
+    return ddp.solve(problems.x, problems.t, p=problems.given_p, **bank.guess(rows, problems.t, problems.x))
 
 
-def tube_states(bank: SolutionBank, n: int, width: float, horizon: float,
-                rng: np.random.Generator) -> tuple[NDArray[np.int64], Array, Array]:
-    """(rows of the bank, t0, x): n states x = x_row(t0) + width * exp(U(-1.5, 0)) * scale * N(0, I)."""
+@dataclass(frozen=True, eq=False)
+class Problems:
+    """Where solutions are asked for: states, times, parameters."""
+
+    x: Array  # [n, nx]
+    t: Array  # [n]
+    p: Array  # [n, np]
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    @property
+    def given_p(self) -> Array | None:
+        """As solvers take p."""
+        return self.p if self.p.shape[1] else None
+
+    @staticmethod
+    def initial(ocp: OCP, n: int, rng: np.random.Generator) -> Problems:
+        """n fresh initial states and parameters."""
+        return Problems(ocp.initial_states.sample(n, rng), np.zeros(n), ocp.sample_parameters(n, rng))
+
+    @staticmethod
+    def join(parts: Sequence[Problems]) -> Problems:
+        return Problems(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("x", "t", "p")))
+
+
+def tube_states(ocp: OCP, bank: SolutionBank, n: int, width: float,
+                rng: np.random.Generator) -> tuple[NDArray[np.int64], Problems]:
+    """(rows of the bank, n problems): x = x_row(t0) + width * exp(U(-1.5, 0)) * scale * N(0, I), and p likewise."""
     rows = rng.integers(0, len(bank), n)
-    t0 = rng.uniform(0, 0.97 * horizon, n)
-    x = bank.states(rows, t0[:, None])[:, 0]
-    x += width * np.exp(rng.uniform(-1.5, 0, (n, 1))) * bank.scale * rng.standard_normal(x.shape)
-    return rows, t0, x
+    t0 = rng.uniform(0, 0.97 * ocp.horizon, n)
+    x, p = bank.states(rows, t0[:, None])[:, 0], bank.solution.parameters[rows]
+    nx = x.shape[1]
+    x += width * np.exp(rng.uniform(-1.5, 0, (n, 1))) * bank.scale[:nx] * rng.standard_normal(x.shape)
+    if ocp.np:  # inside of where they lie
+        away = width * np.exp(rng.uniform(-1.5, 0, (n, 1))) * bank.scale[nx:] * rng.standard_normal(p.shape)
+        p = np.clip(p + away, *ocp.parameter_box)
+    return rows, Problems(x, t0, p)
 
 
-def visited(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, n: int, kick: float,
+def visited(ddp: DDP, bank: SolutionBank, policy: Policy, torch_ocp: InTorch, n: int, kick: float,
             rng: np.random.Generator) -> Solution:
     """Tails from n states that the policy visits under kicks."""
-    x, t0 = kicked_states(ddp.ocp, bank, policy, f, n, kick, rng, ddp.substeps)
-    return answered(ddp, bank, policy, f, x, t0)
+    return answered(ddp, bank, policy, torch_ocp,
+                    kicked_states(bank, policy, torch_ocp, n, kick, rng, ddp.substeps))
 
 
-def kicked_states(ocp: OCP, bank: SolutionBank, policy: torch.nn.Module, f: Field, n: int, kick: float,
-                  rng: np.random.Generator, substeps: int = 1) -> tuple[Array, Array]:
-    """(x, t0) of n states, or fewer, that the policy visits under kicks, at any time: those not far out of the box."""
-    x0 = ocp.initial_states.sample(max(n // 8, 1), rng)
-    t, x = kicked_rollout(ocp, policy, f, x0, kick * bank.scale, rng, substeps=substeps)
+def kicked_states(bank: SolutionBank, policy: Policy, torch_ocp: InTorch, n: int, kick: float,
+                  rng: np.random.Generator, substeps: int = 1) -> Problems:
+    """n states, or fewer, that the policy visits under kicks, at any time: those not far out of the box."""
+    ocp = torch_ocp.ocp
+    start = Problems.initial(ocp, max(n // (2 if ocp.np else 8), 1), rng)
+    t, x = kicked_rollout(torch_ocp, policy, start, kick * bank.scale[:ocp.system.nx], rng, substeps=substeps)
     rows, k = rng.integers(0, len(x), n), rng.integers(0, len(t) - 1, n)
-    x, t0 = x[rows, k], t[k]
+    found = Problems(x[rows, k], t[k], start.p[rows])
     far = 10 * np.maximum(np.abs(ocp.system.lbx), np.abs(ocp.system.ubx))
-    fine = (np.abs(x) < far).all(axis=1)  # False for NaN
+    fine = (np.abs(found.x) < far).all(axis=1)  # False for NaN
     if not fine.any():
         raise ValueError(f"the controller of {ocp.system.name} drives every state far out of the box: train for more "
                          "iterations, in a narrower tube (TrainSettings.width) or with smaller pushes (.kick)")
-    return x[fine], t0[fine]
+    return Problems(found.x[fine], found.t[fine], found.p[fine])
 
 
-def answered(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, x: Array, t0: Array) -> Solution:
-    """Tails from (x, t0): the better of a start from the policy's own answer and one from the nearest solution."""
-    own = ddp.solve(x, t0, u=policy_controls(policy, f, x, t0, ddp.ocp.horizon, ddp.intervals, ddp.substeps))
-    near = ddp.solve(x, t0, **bank.guess(bank.nearest(x, t0)[:, 0], t0, x))
+def answered(ddp: DDP, bank: SolutionBank, policy: Policy, torch_ocp: InTorch, at: Problems) -> Solution:
+    """Tails from there: the better of a start from the policy's own answer and one from the nearest solution."""
+    p = at.given_p
+    own = ddp.solve(at.x, at.t, u=policy_controls(policy, torch_ocp, at, ddp.intervals, ddp.substeps), p=p)
+    near = ddp.solve(at.x, at.t, p=p, **bank.guess(bank.nearest(at.x, at.t, p=p)[:, 0], at.t, at.x))
     return better(own, near)
 
 
-def kicked_rollout(ocp: OCP, policy: torch.nn.Module, f: Field, x0: Array, kick: Array, rng: np.random.Generator,
+def kicked_rollout(torch_ocp: InTorch, policy: Policy, start: Problems, kick: Array, rng: np.random.Generator,
                    steps: int = 160, kicks: int = 6, substeps: int = 1) -> tuple[Array, Array]:
-    """The policy's states (t [steps+1], x [B, steps+1, nx]) from x0, pushed by N(0, kick^2) at `kicks` random times."""
-    h = ocp.horizon / steps
-    x, path = torch.from_numpy(x0), [x0]
-    times = rng.integers(0, steps, (kicks, len(x0)))
+    """The policy's states (t [steps+1], x [B, steps+1, nx]) from the start, pushed by N(0, kick^2) at `kicks` random
+    times."""
+    h, here = torch_ocp.ocp.horizon / steps, torch_ocp.at(start.p)
+    x, path = torch.from_numpy(start.x), [start.x]
+    times = rng.integers(0, steps, (kicks, len(start)))
     with torch.no_grad():
         for k in range(steps):
-            push = (times == k).sum(axis=0)[:, None] * kick * rng.standard_normal(x0.shape)
+            push = (times == k).sum(axis=0)[:, None] * kick * rng.standard_normal(start.x.shape)
             x = x + torch.from_numpy(push)
-            u = policy(x, torch.full((len(x), 1), (k + 0.5) * h, dtype=x.dtype))
-            x = rk4_interval(f, x, u, h, substeps)
+            t = torch.full((len(x), 1), k * h, dtype=x.dtype)
+            x = here.after(x, policy(x, t + h / 2, *here.p), t, h, substeps)
             path.append(x.numpy())
-    return np.linspace(0, ocp.horizon, steps + 1), np.stack(path, axis=1)
+    return np.linspace(0, torch_ocp.ocp.horizon, steps + 1), np.stack(path, axis=1)
 
 
-def policy_controls(policy: torch.nn.Module, f: Field, x: Array, t0: Array, horizon: float, K: int,
-                    substeps: int = 1) -> Array:
-    """The controls [B, K, nu] that the policy gives from (x, t0), each held over an interval of [t0, T]."""
-    state, start = torch.from_numpy(x), torch.from_numpy(t0)[:, None]
-    h = (horizon - start) / K
+def policy_controls(policy: Policy, torch_ocp: InTorch, at: Problems, K: int, substeps: int = 1) -> Array:
+    """The controls [B, K, nu] that the policy gives from there, each held over an interval of [t, T]."""
+    state, start, here = torch.from_numpy(at.x), torch.from_numpy(at.t)[:, None], torch_ocp.at(at.p)
+    h = (torch_ocp.ocp.horizon - start) / K
     controls = []
     with torch.no_grad():
         for k in range(K):
-            controls.append(policy(state, start + (k + 0.5) * h))
-            state = rk4_interval(f, state, controls[-1], h, substeps)
+            controls.append(policy(state, start + (k + 0.5) * h, *here.p))
+            state = here.after(state, controls[-1], start + k * h, h, substeps)
     return torch.stack(controls, dim=1).numpy()
 
 
-def continuous_cost(ocp: OCP, policy: torch.nn.Module, f: Field, x0: Array, steps: int,
-                    t0: float | Array = 0.0) -> Array:
-    """J [B] of the policy as continuous feedback from (x0, t0), t0 a number or [B], by RK4 on (x, t, cost).
-
-    Soft path constraints included.
-    """
-    n, L = x0.shape[1], to_torch(ocp.L_soft)
+def continuous_cost(policy: Policy, torch_ocp: InTorch, at: Problems, steps: int) -> Array:
+    """J [B] of the policy as continuous feedback from there, by RK4 on (x, t, cost); soft path constraints included."""
+    n, here = at.x.shape[1], torch_ocp.at(at.p)
 
     def closed_loop(z: Tensor, _: None) -> Tensor:
         x, t = z[:, :n], z[:, n:n + 1]
-        u = policy(x, t)
-        return torch.cat([f(x, u), torch.ones_like(t), L(x, u)], dim=1)
+        u = policy(x, t, *here.p)
+        return torch.cat([here.f(x, u, t), torch.ones_like(t), here.L(x, u, t)], dim=1)
 
-    start = np.broadcast_to(np.asarray(t0, dtype=np.float64), len(x0))
-    z = torch.from_numpy(np.column_stack([x0, start, np.zeros(len(x0))]))
-    h = torch.from_numpy((ocp.horizon - start) / steps)[:, None]
+    z = torch.from_numpy(np.column_stack([at.x, at.t, np.zeros(len(at))]))
+    h = torch.from_numpy((torch_ocp.ocp.horizon - at.t) / steps)[:, None]
     with torch.no_grad():
         for _ in range(steps):
             z = rk4(closed_loop, z, None, h)
-        return (z[:, n + 1] + to_torch(ocp.G)(z[:, :n])[:, 0]).numpy()
+        return (z[:, n + 1] + here.G(z[:, :n])[:, 0]).numpy()

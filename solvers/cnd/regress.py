@@ -69,7 +69,8 @@ def policy_loss(ocp: OCP, net: FeatureNet, inverse: ca.Function, labels: Labels)
 def _control_weights(ocp: OCP, low: Tensor, high: Tensor) -> Tensor:
     """The diagonal of L_uu at the goal in the network's units [1, nu], mean 1; equal where it is not positive."""
     s = ocp.system
-    L_zz = ocp.functions.L_derivatives(ocp.x_goal, ocp.u_goal)[2].full()
+    at_goal = ocp.functions.arguments.columns(x=ocp.x_goal, u=ocp.u_goal, t=0.0, p=ocp.nominal)
+    L_zz = ocp.functions.L_derivatives(*at_goal)[2].full()
     H = torch.from_numpy(np.diag(L_zz)[None, s.nx:].copy()).float()
     unit = torch.from_numpy(np.asarray(s.ubu) - s.lbu).float() / (high - low)  # u for one unit of y
     weights = H * unit**2 if bool((H > 0).all()) else torch.ones(1, s.nu)
@@ -78,5 +79,5 @@ def _control_weights(ocp: OCP, low: Tensor, high: Tensor) -> Tensor:
 
 def _features(net: FeatureNet, labels: Labels) -> Tensor:
     """The features of all labels [n, F], in float32."""
-    args = [torch.from_numpy(a) for a in (labels.x, labels.t[:, None], labels.dt[:, None])]
-    return net.features(*args[:net.inputs.n_in()])[0].float()
+    known = {"x": labels.x, "t": labels.t[:, None], "p": labels.p, "dt": labels.dt[:, None]}
+    return net.features(*(torch.from_numpy(known[name]) for name in net.inputs.name_in()))[0].float()

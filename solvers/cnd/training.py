@@ -34,7 +34,8 @@ from nocl.sampling import own_numbers
 from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.features import at_rate, policy_net
 from nocl.solvers.cnd.identity import identity
-from nocl.solvers.cnd.labels import Labels, at_other_rates, tube, visited
+from nocl.solvers.cnd.in_torch import InTorch
+from nocl.solvers.cnd.labels import Labels, Problems, at_other_rates, tube, visited
 from nocl.solvers.cnd.paper import PaperSettings, train_paper
 from nocl.solvers.cnd.regress import fit_net, policy_loss
 from nocl.solvers.cnd.settings import TrainSettings
@@ -57,7 +58,6 @@ from nocl.substeps import FINE
 from nocl.support import checks, store
 from nocl.support.checks import Array
 from nocl.support.threads import one_thread
-from nocl.translate.torch_functions import to_torch
 
 if TYPE_CHECKING:
     from nocl.solvers.cnd.paper import PaperSettings
@@ -95,6 +95,7 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
     if method == "paper":
         chosen = _expect(settings, PaperSettings)
         checkpoint = None if out is None else Path(out) / CHECKPOINT
+        ocp.refuse_parameters("train(method='paper')")
         policy, value, card = train_paper(ocp, dynamics, chosen, seed=seed, progress=progress, checkpoint=checkpoint)
         return CND(ocp, policy, value, card)
     ocp.check_strict("train")
@@ -127,7 +128,7 @@ class Training:
                  out: str | os.PathLike[str] | None, progress: bool | None) -> None:
         self.ocp, self.settings, self.seed = ocp, settings, seed
         self.learned = dynamics is not None
-        self.f = to_torch(ocp.functions.f) if dynamics is None else dynamics
+        self.in_torch = InTorch(ocp, dynamics)
         self.substeps = settings.substeps or substeps_for(ocp, dynamics, settings.intervals, FINE)
         soft = {"dynamics": dynamics, "constraints": "soft"}
         self.ddp = DDP(ocp, intervals=settings.intervals, substeps=self.substeps, **soft)
@@ -173,11 +174,12 @@ class Training:
                 bar.set_postfix_str(what, refresh=False)
                 bar.update()
 
-            seeds = solve_globally(self.ddp, self.ocp.initial_states.sample(s.seeds, rng), starts=s.starts, seed=rng,
-                                   report=report)
+            first = Problems.initial(self.ocp, s.seeds, rng)
+            seeds = solve_globally(self.ddp, first.x, p=first.given_p, starts=s.starts, seed=rng, report=report)
             self.bank = SolutionBank.of(self.ddp, seeds)
             if s.states:
-                more = extend(self.ddp, self.bank, self.ocp.initial_states.sample(s.states, rng))
+                further = Problems.initial(self.ocp, s.states, rng)
+                more = extend(self.ddp, self.bank, further.x, p=further.given_p)
                 self.bank = SolutionBank.of(self.ddp, type(more).join([seeds, more]))
             parts = [self.bank.solution] + ([tube(self.ddp, self.bank, s.tails, s.width, rng)] if s.tails else [])
             self.labels = Labels.join([self._labels(p, rng) for p in parts])
@@ -185,7 +187,7 @@ class Training:
 
     def _labels(self, solution: Solution, rng: np.random.Generator) -> Labels:
         """Labels of the continuous controls, and with control_dt of held ones."""
-        parts = [Labels.of(solution, self.f, self._unit(), self.substeps)]
+        parts = [Labels.of(solution, self.in_torch, self._unit(), self.substeps)]
         if self.settings.control_dt:
             parts += [Labels.held(solution, self._unit()), at_other_rates(self.ddp, solution, self._unit(), rng)]
         return Labels.join(parts)
@@ -204,7 +206,7 @@ class Training:
     def _visit(self) -> None:
         s, rng = self.settings, self._rng(self.round)
         with self._stage(f"round {self.round}: visited states", 1) as bar:
-            solved = visited(self.ddp, self.bank, self.policy, self.f, s.visits, s.kick, rng)
+            solved = visited(self.ddp, self.bank, self.policy, self.in_torch, s.visits, s.kick, rng)
             self.labels = Labels.join([self.labels, self._labels(solved, rng)])
             bar.update()
 
@@ -222,17 +224,17 @@ class Training:
         on states of kicked rollouts."""
         s, rng = self.settings, self._rng(1_000_000)
         with self._stage("held-out states", 1) as bar:
-            solvers, x0 = (self.ddp, self.fine, self.bank), self.ocp.initial_states.sample(s.held_out, rng)
-            starts = held_out_optima(*solvers, x0)
-            tails = kicked_optima(*solvers, self.policy, self.f, 4 * s.held_out, s.kick, rng)
+            solvers, acting = (self.ddp, self.fine, self.bank), (self.policy, self.in_torch)
+            starts = held_out_optima(*solvers, Problems.initial(self.ocp, s.held_out, rng))
+            tails = kicked_optima(*solvers, *acting, 4 * s.held_out, s.kick, rng)
             row = {"round": self.round, "labels": len(self.labels), "loss": self.losses,
                    "unsolved": s.held_out - len(starts),
-                   **summary(gap(self.ocp, self.policy, self.f, starts, substeps=self.fine.substeps), "gap"),
-                   **summary(gap(self.ocp, self.policy, self.f, tails, self._unit(), self.fine.substeps), "kicked")}
+                   **summary(gap(*acting, starts, substeps=self.fine.substeps), "gap"),
+                   **summary(gap(*acting, tails, self._unit(), self.fine.substeps), "kicked")}
             if s.control_dt:
-                best = extend(self.ddp, self.bank, starts.x[:, 0])
+                best = extend(self.ddp, self.bank, starts.x[:, 0], p=starts.p)
                 held = at_rate(self.net, self.ocp.horizon / s.intervals)
-                row |= summary(held_gap(self.ocp, held, self.f, best, self.substeps), "held")
+                row |= summary(held_gap(held, self.in_torch, best, self.substeps), "held")
             bar.set_postfix_str(f"gap {100 * row['gap_median']:.3f} %, p95 {100 * row['gap_p95']:.3f} %, "
                                 f"kicked {100 * row['kicked_median']:.3f} %")
             bar.update()
@@ -254,7 +256,7 @@ class Training:
                 with _seeded(self.seed + 1):
                     net = value_net(self.ocp, labels, s.hidden)
             losses += self._fit_value(net, labels, attempt)
-            scores = value_scores(self.ocp, net, self.policy, self.f, optima)
+            scores = value_scores(net, self.policy, self.in_torch, optima)
             worst = float(np.max([scores[f"{name}_error"] for name in optima]))
             tried.append(worst if np.isfinite(worst) else np.inf)
             if len(tried) == 1 or tried[-1] < min(tried[:-1]):
@@ -275,12 +277,13 @@ class Training:
         there are path constraints, those that can hold them."""
         s, rng = self.settings, self._rng(3_000_000)
         solvers, n = (self.ddp, self.fine, self.bank), VALUE_HELD_OUT * s.held_out
+        acting = (self.policy, self.in_torch)
         with self._stage("held-out states for V", 3) as bar:
-            sets = {"initial": held_out_optima(*solvers, self.ocp.initial_states.sample(n, rng))}
+            sets = {"initial": held_out_optima(*solvers, Problems.initial(self.ocp, n, rng))}
             bar.update()
-            sets["tube"] = tube_optima(*solvers, self.policy, self.f, n, s.width, rng)
+            sets["tube"] = tube_optima(*solvers, *acting, n, s.width, rng)
             bar.update()
-            sets["tails"] = kicked_optima(*solvers, self.policy, self.f, n, s.kick, rng)
+            sets["tails"] = kicked_optima(*solvers, *acting, n, s.kick, rng)
             bar.update()
         held = {name: feasible(self.ocp, optima) for name, optima in sets.items()}
         return {name: optima for name, optima in held.items() if len(optima)} or sets
@@ -288,8 +291,8 @@ class Training:
     def _value_labels(self, rng: np.random.Generator) -> ValueLabels:
         s = self.settings
         with self._stage("value labels", 1) as bar:
-            found = value_tails(self.ddp, self.bank, self.policy, self.f, initial=s.value_initial, tails=s.value_tails,
-                                visits=s.value_visits, width=s.width, kick=s.kick, rng=rng)
+            found = value_tails(self.ddp, self.bank, self.policy, self.in_torch, initial=s.value_initial,
+                                tails=s.value_tails, visits=s.value_visits, width=s.width, kick=s.kick, rng=rng)
             labels = ValueLabels.of(on_fine_grid(self.fine, found))
             bar.update()
         return labels
@@ -297,7 +300,7 @@ class Training:
     def _fit_value(self, net: FeatureNet, labels: ValueLabels, attempt: int) -> list[float]:
         s = self.settings
         iterations = s.value_iterations * (2 if attempt else 1)
-        loss = value_loss(net.float(), labels, self.bank.scale)
+        loss = value_loss(net.float(), labels, self.bank.scale[:self.ocp.system.nx])
         with self._stage("value function" + (", once more" if attempt else ""), iterations, fits=True) as bar:
             report = _Reporter(bar, iterations)
             fit_net(net, loss, len(labels), iterations=iterations, batch=s.batch, lr=s.lr, seed=self.seed + attempt,
@@ -331,7 +334,7 @@ class Training:
         return own_numbers(self.seed, stage)
 
     def _identity(self) -> str:
-        return identity(self.ocp, self.settings, self.seed, self.f)
+        return identity(self.ocp, self.settings, self.seed, self.in_torch.function["f"])
 
     def _save(self) -> None:
         if self.checkpoint is None:
@@ -351,7 +354,8 @@ class Training:
         state, meta = store.load_checkpoint(self.checkpoint)
         if meta["identity"] != self._identity():
             return False
-        self.labels = Labels(**_arrays(state["labels"]))
+        arrays = _arrays(state["labels"])
+        self.labels = Labels(**{"p": np.zeros((len(arrays["t"]), 0)), **arrays})  # no empty arrays are in files
         self.bank = SolutionBank.from_arrays(self.ddp, _arrays(state["bank"]))
         self.round, self.history, self.first = meta["round"], meta["history"], meta["first"]
         self.seconds, self.fitting, self.fitting_cpu = meta["seconds"], meta["fitting"], meta["fitting_cpu"]
@@ -387,7 +391,7 @@ def _seeded(seed: int) -> Iterator[None]:
 
 
 def _tensors(arrays: dict[str, Any]) -> dict[str, torch.Tensor]:
-    return {k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in arrays.items() if v is not None}
+    return {k: torch.from_numpy(np.ascontiguousarray(v)) for k, v in arrays.items() if v is not None and v.size}
 
 
 def _arrays(tensors: dict[str, torch.Tensor]) -> dict[str, Array]:

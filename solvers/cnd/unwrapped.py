@@ -21,7 +21,7 @@ class Unwrapped:
     they are. `reset()` does so at will.
     """
 
-    def __init__(self, controller: Callable[[Array, float], Array], ocp: OCP) -> None:
+    def __init__(self, controller: Callable[..., Array], ocp: OCP) -> None:
         self.controller, self.ocp = controller, ocp
         self.angles = [i for i in ocp.system.angle_indices if i not in ocp.periodic]
         self.reset()
@@ -31,8 +31,8 @@ class Unwrapped:
         self.last: Array | None = None
         self.time = -np.inf
 
-    def __call__(self, x: ArrayLike, t: float = 0.0) -> Any:
-        """u [nu] or [B, nu] at states x [nx] or [B, nx]."""
+    def __call__(self, x: ArrayLike, t: float = 0.0, *p: Any) -> Any:
+        """u [nu] or [B, nu] at states x [nx] or [B, nx], and parameters where the controller takes some."""
         rows, single = checks.states(x, self.ocp.system.nx, self.ocp.system.name, "x")
         if self.last is not None and (t < self.time or self.last.shape != rows.shape):
             self.reset()
@@ -41,5 +41,5 @@ class Unwrapped:
             turns = np.round((self.last[:, self.angles] - rows[:, self.angles]) / (2 * np.pi))
             rows[:, self.angles] += 2 * np.pi * turns
         self.last, self.time = rows, t
-        u = self.controller(rows, t)
+        u = self.controller(rows, t, *p)
         return u[0] if single else u

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from nocl.data import Solution
-from nocl.hjb import hjb_residual, rollout
+from nocl.hjb import hjb_residual
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
-from nocl.solvers.cnd.labels import SMALL, Field, answered, continuous_cost, kicked_states, tube_states
+from nocl.solvers.cnd.in_torch import InTorch
+from nocl.solvers.cnd.labels import SMALL, Policy, Problems, answered, continuous_cost, kicked_states, tube_states
 from nocl.solvers.ddp.bank import SolutionBank, extend
 from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
-from nocl.translate.rk4 import rk4_cost
-from nocl.translate.torch_functions import to_torch
 
 NODES = 16  # of each solution at which the HJB residual is taken
 
@@ -25,20 +24,20 @@ NODES = 16  # of each solution at which the HJB residual is taken
 def refined(fine: DDP, coarse: Solution) -> Solution:
     """The solutions that succeeded, solved again on the fine grid."""
     s = coarse[coarse.success]
-    finer = fine.solve(s.x[:, 0], s.t[:, 0], u=np.repeat(s.u, fine.intervals // s.u.shape[1], axis=1))
+    finer = fine.solve(s.x[:, 0], s.t[:, 0], p=s.p, u=np.repeat(s.u, fine.intervals // s.u.shape[1], axis=1))
     return finer[finer.success]
 
 
-def held_out_optima(ddp: DDP, fine: DDP, bank: SolutionBank, x0: Array) -> Solution:
+def held_out_optima(ddp: DDP, fine: DDP, bank: SolutionBank, fresh: Problems) -> Solution:
     """The optima of fresh initial states, from the bank's nearest."""
-    return refined(fine, extend(ddp, bank, x0))
+    return refined(fine, extend(ddp, bank, fresh.x, p=fresh.given_p))
 
 
-def kicked_optima(ddp: DDP, fine: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, n: int, kick: float,
+def kicked_optima(ddp: DDP, fine: DDP, bank: SolutionBank, policy: Policy, torch_ocp: InTorch, n: int, kick: float,
                   rng: np.random.Generator) -> Solution:
     """The optima from n states that the policy visits under kicks, at times all over the horizon."""
-    x, t0 = kicked_states(ddp.ocp, bank, policy, f, n, kick, rng, ddp.substeps)
-    return refined(fine, answered(ddp, bank, policy, f, x, t0))
+    at = kicked_states(bank, policy, torch_ocp, n, kick, rng, ddp.substeps)
+    return refined(fine, answered(ddp, bank, policy, torch_ocp, at))
 
 
 def feasible(ocp: OCP, s: Solution) -> Solution:
@@ -46,30 +45,34 @@ def feasible(ocp: OCP, s: Solution) -> Solution:
     of the penalty."""
     if not ocp.path_constraints:
         return s
-    h = to_torch(ocp.h)(torch.from_numpy(s.x.reshape(-1, s.x.shape[2])))
-    return s[(h.numpy() >= 0).all(axis=1).reshape(s.x.shape[:2]).all(axis=1)]
+    return s[(ocp.least(s.x, s.t, s.parameters) >= 0).all(axis=1)]
 
 
-def tube_optima(ddp: DDP, fine: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, n: int, width: float,
+def tube_optima(ddp: DDP, fine: DDP, bank: SolutionBank, policy: Policy, torch_ocp: InTorch, n: int, width: float,
                 rng: np.random.Generator) -> Solution:
     """The optima from n states of the tube."""
-    _, t0, x = tube_states(bank, n, width, ddp.ocp.horizon, rng)
-    return refined(fine, answered(ddp, bank, policy, f, x, t0))
+    _, at = tube_states(ddp.ocp, bank, n, width, rng)
+    return refined(fine, answered(ddp, bank, policy, torch_ocp, at))
 
 
-def gap(ocp: OCP, policy: torch.nn.Module, f: Field, best: Solution, unit: float = 0.0, substeps: int = 1) -> Array:
+def gap(policy: Policy, torch_ocp: InTorch, best: Solution, unit: float = 0.0, substeps: int = 1) -> Array:
     """(J - J*) / (|J*| + SMALL unit) [B] of the policy as continuous feedback, from where the solutions start."""
-    J = continuous_cost(ocp, policy, f, best.x[:, 0], substeps * best.u.shape[1], best.t[:, 0])
+    start = Problems(best.x[:, 0], best.t[:, 0], best.parameters)
+    J = continuous_cost(policy, torch_ocp, start, substeps * best.u.shape[1])
     shares: Array = (J - best.cost) / (np.abs(best.cost) + SMALL * unit)
     return shares
 
 
-def held_gap(ocp: OCP, policy: torch.nn.Module, f: Field, best: Solution, substeps: int = 1) -> Array:
+def held_gap(policy: Policy, torch_ocp: InTorch, best: Solution, substeps: int = 1) -> Array:
     """The same of a policy that is asked at the solutions' nodes and held; they start at t = 0."""
+    here, K = torch_ocp.at(best.parameters), best.u.shape[1]
+    x, h, running = torch.from_numpy(best.x[:, 0]), torch_ocp.ocp.horizon / K, torch.zeros(len(best), 1)
     with torch.no_grad():
-        path = rollout(policy, f, to_torch(ocp.L_soft), torch.from_numpy(best.x[:, 0]), ocp.horizon, best.u.shape[1],
-                       step=partial(rk4_cost, substeps=substeps))
-        J = (path.running + to_torch(ocp.G)(path.x[:, -1]))[:, 0].numpy()
+        for k in range(K):
+            t = torch.full((len(x), 1), k * h, dtype=x.dtype)
+            x, cost = here.interval(x, policy(x, t, *here.p), t, h, substeps)
+            running = running + cost
+        J = (running + here.G(x))[:, 0].numpy()
     shares: Array = (J - best.cost) / np.abs(best.cost)
     return shares
 
@@ -81,7 +84,7 @@ def summary(shares: Array, name: str) -> dict[str, float]:
     return {f"{name}_median": float(median), f"{name}_p95": float(p95)}
 
 
-def value_scores(ocp: OCP, value: FeatureNet, policy: torch.nn.Module, f: Field,
+def value_scores(value: FeatureNet, policy: Policy, torch_ocp: InTorch,
                  optima: dict[str, Solution]) -> dict[str, float]:
     """|V - J*| / |J*| (mean and median), V_x against costates (medians) of each set of optima; the HJB residual.
 
@@ -89,33 +92,34 @@ def value_scores(ocp: OCP, value: FeatureNet, policy: torch.nn.Module, f: Field,
     """
     row: dict[str, float] = {}
     for name, s in optima.items():
-        V, V_x = _value_and_slope(value, s.x[:, 0], s.t[:, 0])
+        V, V_x = _value_and_slope(value, s.x[:, 0], s.t[:, 0], torch_ocp.at(s.parameters).p)
         error = np.abs(V - s.cost) / np.abs(s.cost)
         row |= {f"{name}_error": float(error.mean()), f"{name}_error_median": float(np.median(error))}
         size, true = np.linalg.norm(V_x, axis=1), np.linalg.norm(s.V_x[:, 0], axis=1)
         cosine = np.clip((V_x * s.V_x[:, 0]).sum(axis=1) / (size * true), -1, 1)
         row[f"{name}_degrees"] = float(np.degrees(np.median(np.arccos(cosine))))
         row[f"{name}_slope_error"] = float(np.median(np.abs(size / true - 1)))
-    return row | _hjb(ocp, value, policy, f, list(optima.values())[-1])
+    return row | _hjb(value, policy, torch_ocp, list(optima.values())[-1])
 
 
-def _value_and_slope(value: FeatureNet, x: Array, t: Array) -> tuple[Array, Array]:
+def _value_and_slope(value: FeatureNet, x: Array, t: Array, p: list[Tensor]) -> tuple[Array, Array]:
     states = torch.from_numpy(x).clone().requires_grad_(True)
     with torch.enable_grad():
-        V = value(states, torch.from_numpy(t)[:, None])
+        V = value(states, torch.from_numpy(t)[:, None], *p)
         (slope,) = torch.autograd.grad(V.sum(), states)
     return V.detach().numpy()[:, 0], slope.numpy()
 
 
-def _hjb(ocp: OCP, value: FeatureNet, policy: torch.nn.Module, f: Field, tails: Solution) -> dict[str, float]:
+def _hjb(value: FeatureNet, policy: Policy, torch_ocp: InTorch, tails: Solution) -> dict[str, float]:
     every = slice(0, -1, max(tails.u.shape[1] // NODES, 1))
     x = torch.from_numpy(np.ascontiguousarray(tails.x[:, every].reshape(-1, tails.x.shape[2])))
     t = torch.from_numpy(np.ascontiguousarray(tails.t[:, every].reshape(-1, 1)))
-    L = to_torch(ocp.L_soft)
+    here = torch_ocp.at(np.repeat(tails.parameters, len(x) // len(tails), axis=0))
     with torch.no_grad():
-        u = policy(x, t)
-        usual = float(L(x, u).abs().mean())
-    residual = hjb_residual(value, f, L, x, u, t).detach().abs().numpy()
+        u = policy(x, t, *here.p)
+        usual = float(here.L(x, u, t).abs().mean())
+    residual = hjb_residual(lambda x, t: value(x, t, *here.p), lambda x, u: here.f(x, u, t),
+                            lambda x, u: here.L(x, u, t), x, u, t).detach().abs().numpy()
     return {"hjb_median": float(np.median(residual)) / usual, "hjb_mean": float(residual.mean()) / usual}
 
 

@@ -20,7 +20,8 @@ from nocl.data import Solution
 from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.cnd.features import features
-from nocl.solvers.cnd.labels import Field, answered, kicked_states, tube_states
+from nocl.solvers.cnd.in_torch import InTorch
+from nocl.solvers.cnd.labels import Policy, Problems, answered, kicked_states, tube_states
 from nocl.solvers.cnd.loss_kernel import ValueKernel
 from nocl.solvers.cnd.regress import LossFunction
 from nocl.solvers.cnd.validate import refined
@@ -43,6 +44,7 @@ class ValueLabels:
 
     x: Array  # [n, nx]
     t: Array  # [n]
+    p: Array  # [n, np]
     V: Array  # [n]
     V_x: Array  # [n, nx]
 
@@ -52,13 +54,15 @@ class ValueLabels:
     @staticmethod
     def of(solutions: Iterable[Solution]) -> ValueLabels:
         """Start, end and nodes at doubling distances between them: later nodes have drawn together and tell little."""
-        names, parts = list(ValueLabels.__dataclass_fields__), []
-        for s in solutions:
-            solved, K = s.success, s.u.shape[1]
+        parts = []
+        for s in (every[every.success] for every in solutions):
+            K = s.u.shape[1]
             doubling = 2 ** np.arange(int(np.log2(max(K - 1, 1))) + 1)
             nodes = np.unique(np.concatenate([[0, K], doubling[doubling < K]]))
-            parts.append([np.concatenate(getattr(s, name)[solved][:, nodes]) for name in names if solved.any()])
-        return ValueLabels(*(np.concatenate(column) for column in zip(*filter(None, parts), strict=True)))
+            if len(s):
+                x, t, V, V_x = (np.concatenate(value[:, nodes]) for value in (s.x, s.t, s.V, s.V_x))
+                parts.append(ValueLabels(x, t, np.repeat(s.parameters, len(nodes), axis=0), V, V_x))
+        return ValueLabels.join(parts)
 
 
     @staticmethod
@@ -67,15 +71,14 @@ class ValueLabels:
         return ValueLabels(*(np.concatenate([getattr(p, n) for p in parts]) for n in ValueLabels.__dataclass_fields__))
 
 
-def value_tails(ddp: DDP, bank: SolutionBank, policy: torch.nn.Module, f: Field, *, initial: int, tails: int,
+def value_tails(ddp: DDP, bank: SolutionBank, policy: Policy, torch_ocp: InTorch, *, initial: int, tails: int,
                 visits: int, width: float, kick: float, rng: np.random.Generator) -> Solution:
     """Solutions from initial states, and tails from states of the tube and from those that the policy visits under
     kicks."""
-    x0 = ddp.ocp.initial_states.sample(initial, rng)
-    _, t_tube, x_tube = tube_states(bank, tails, width, ddp.ocp.horizon, rng)
-    x_kicked, t_kicked = kicked_states(ddp.ocp, bank, policy, f, visits, kick, rng, ddp.substeps)
-    x, t = np.concatenate([x0, x_tube, x_kicked]), np.concatenate([np.zeros(initial), t_tube, t_kicked])
-    return answered(ddp, bank, policy, f, x, t)
+    start = Problems.initial(ddp.ocp, initial, rng)
+    _, near = tube_states(ddp.ocp, bank, tails, width, rng)
+    kicked = kicked_states(bank, policy, torch_ocp, visits, kick, rng, ddp.substeps)
+    return answered(ddp, bank, policy, torch_ocp, Problems.join([start, near, kicked]))
 
 
 def on_fine_grid(fine: DDP, coarse: Solution) -> Iterator[Solution]:
@@ -86,9 +89,9 @@ def on_fine_grid(fine: DDP, coarse: Solution) -> Iterator[Solution]:
 
 
 def value_net(ocp: OCP, labels: ValueLabels, sizes: tuple[int, ...]) -> FeatureNet:
-    """(x, t) -> V = floor + unit |y|^2; the floor is 0 where all labels are positive, else below them."""
+    """(x, t[, p]) -> V = floor + unit |y|^2; the floor is 0 where all labels are positive, else below them."""
     s, at = ocp.system, ocp.functions.feedback()
-    phi = features(ocp, labels.x, labels.t, plain=True)
+    phi = features(ocp, labels, plain=True)
     y, floor = ca.SX.sym("y", s.nx + 1), _floor(labels)
     unit = float(np.median(labels.V - floor))
     V = at.function("value", {"V": floor + unit * ca.sumsqr(y)}, y=y)
@@ -135,8 +138,9 @@ def value_loss(net: FeatureNet, labels: ValueLabels, scale: Array, slope_weight:
 
 def _units(net: FeatureNet) -> tuple[float, float]:
     """(floor, unit) of a value network: V = floor + unit |y|^2."""
-    x, y = np.zeros(net.outputs.size1_in(0)), np.eye(net.outputs.size1_in(2))[0]
-    floor, above = (float(net.outputs(x, 0.0, at)) for at in (0 * y, y))
+    *sizes, outputs = (net.outputs.size1_in(i) for i in range(net.outputs.n_in()))
+    given, y = [np.zeros(n) for n in sizes], np.eye(outputs)[0]
+    floor, above = (float(net.outputs(*given, at)) for at in (0 * y, y))
     return floor, above - floor
 
 
@@ -147,8 +151,9 @@ def _features_and_slopes(net: FeatureNet, labels: ValueLabels, scale: Array) -> 
     J = ca.jacobian(phi, at["x"])
     rows, columns = (torch.tensor(i) for i in J.sparsity().get_triplet())
     both = to_torch(at.function("both", {"phi": ca.densify(phi), "slopes": J.nz[:]}))
-    X, T = torch.from_numpy(labels.x), torch.from_numpy(labels.t)[:, None]
+    known = {"x": labels.x, "t": labels.t[:, None], "p": labels.p}
+    given = [torch.from_numpy(known[name]) for name in at.names]
     with torch.no_grad():
-        parts = [both(X[i:i + CHUNK], T[i:i + CHUNK]) for i in range(0, len(X), CHUNK)]
+        parts = [both(*(z[i:i + CHUNK] for z in given)) for i in range(0, len(labels), CHUNK)]
     values, slopes = (torch.cat([p[i] for p in parts]) for i in range(2))
     return values, slopes * torch.from_numpy(scale)[columns], rows, columns

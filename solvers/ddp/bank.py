@@ -28,7 +28,7 @@ class SolutionBank:
     """Solutions on [0, T], one a row, as guesses for other problems (x0, t0)."""
 
     solution: Solution
-    scale: Array  # [nx], one unit of distance in each state
+    scale: Array  # [nx + np], one unit of distance in each state, then in each parameter
     periodic: tuple[int, ...] = ()  # states that are the same 2 pi further (OCP.periodic): distances are to images
 
     def __len__(self) -> int:
@@ -49,7 +49,7 @@ class SolutionBank:
         if np.isnan(kept.gain).any():
             raise ValueError(f"a bank follows its solutions of {ddp.ocp.system.name} by their gain, which is NaN: "
                              "take those of DDP, or of NMPC.solve(x0, gains=True)")
-        return SolutionBank(replace(kept, tried=None, dense=None), spread(ddp.ocp, kept.x), ddp.ocp.periodic)
+        return SolutionBank(replace(kept, tried=None, dense=None), spread(ddp.ocp, kept.x, kept.p), ddp.ocp.periodic)
 
     @staticmethod
     def from_arrays(ddp: DDP, arrays: dict[str, Any]) -> SolutionBank:
@@ -57,7 +57,7 @@ class SolutionBank:
         return SolutionBank.of(ddp, _solution(arrays))
 
     def add(self, solution: Solution) -> SolutionBank:
-        """A bank with these solutions too, those that succeeded; of two from the same state the cheaper stays."""
+        """A bank with these solutions too, those that succeeded; of two from the same state and p the cheaper stays."""
         grid = self.solution.u.shape[1:]
         if solution.u.shape[1:] != grid or (solution.t != self.solution.t[0]).any():
             raise ValueError(f"the bank's solutions have controls {grid} on [0, {self.horizon:g}]; got controls "
@@ -65,7 +65,7 @@ class SolutionBank:
                              "by the same DDP, from t0 = 0")
         joined = Solution.join([self.solution, solution[solution.success]])
         order = np.argsort(joined.cost, kind="stable")
-        state = np.round(joined.x[order, 0] / (EQUAL * self.scale))
+        state = np.round(_places(joined.x[:, 0], joined.p)[order] / (EQUAL * self.scale))
         kept = order[np.sort(np.unique(state, axis=0, return_index=True)[1])]
         return SolutionBank(joined[np.sort(kept)], self.scale, self.periodic)
 
@@ -90,12 +90,13 @@ class SolutionBank:
             raise ValueError(f"{path} is no solution bank; expected a file of SolutionBank.save: name the right folder")
         return SolutionBank(_solution(state["solution"]), state["scale"], tuple(meta.get("periodic", ())))
 
-    def interpolate(self, x: ArrayLike, t: ArrayLike = 0.0) -> tuple[Array, Array, Array]:
+    def interpolate(self, x: ArrayLike, t: ArrayLike = 0.0, p: Array | None = None) -> tuple[Array, Array, Array]:
         """(u, V, V_x) at states x [B, nx] and times t [B]: the nearest solution's, with u and V to first order in the
-        distance to it, u not clipped; V to second order where the bank has V_xx."""
+        distance to it, u not clipped; V to second order where the bank has V_xx. Of parameters p [B, np], where the
+        problem has some, it takes the nearest solution's."""
         rows = np.atleast_2d(np.asarray(x, dtype=np.float64))
         times = np.broadcast_to(np.asarray(t, dtype=np.float64), len(rows))
-        near, s = self.nearest(rows, times)[:, 0], self.solution
+        near, s = self.nearest(rows, times, p=p)[:, 0], self.solution
         k = self._interval(times)
         there = self.states(near, times[:, None])[:, 0]
         away = rows - there - self._turns(rows, there)
@@ -113,18 +114,23 @@ class SolutionBank:
             V, V_x = V + np.einsum("bi,bi->b", bend, away) / 2, V_x + bend
         return u, V, V_x
 
-    def nearest(self, x: Array, t: ArrayLike = 0.0, count: int = 1) -> Rows:
-        """The `count` rows whose states at t (at the last node before it) are nearest to x [B, nx], the nearest first.
+    def nearest(self, x: Array, t: ArrayLike = 0.0, count: int = 1, p: Array | None = None) -> Rows:
+        """The `count` rows whose states at t (at the last node before it), and parameters, are nearest to x [B, nx] and
+        p [B, np], the nearest first.
 
         t: a number or [B]. Returns [B, count], fewer columns where the bank has fewer rows.
         """
+        if (p is None) != (self.solution.p is None):
+            has = "no parameters" if self.solution.p is None else f"{self.solution.p.shape[1]} parameter(s)"
+            raise ValueError(f"a bank of a problem with {has} got p = {checks.shown(p)}; expected those of its problem")
         columns = list(range(1, min(count, len(self)) + 1))
         found = np.empty((len(x), len(columns)), dtype=np.int64)
         interval = np.broadcast_to(self._interval(t), len(x))
         for k in np.unique(interval):
             here = interval == k
-            tree = KDTree(self._on_circles(self.solution.x[:, k]), boxsize=self._circles)
-            found[here] = tree.query(self._on_circles(x[here]), columns)[1]
+            there = _places(self.solution.x[:, k], self.solution.p)
+            tree = KDTree(self._on_circles(there), boxsize=self._circles)
+            found[here] = tree.query(self._on_circles(_places(x, p)[here]), columns)[1]
         return found
 
     def guess(self, rows: Rows, t0: ArrayLike = 0.0, x: Array | None = None) -> dict[str, Array]:
@@ -184,15 +190,16 @@ class SolutionBank:
         return np.clip((np.asarray(t) * K / self.horizon).astype(np.int64), 0, K - 1)
 
 
-def extend(ddp: DDP, bank: SolutionBank, x0: ArrayLike, neighbours: int = 3, t0: ArrayLike = 0.0) -> Solution:
-    """Solve new problems (x0 [B, nx], t0) from the nearest solutions of a bank: the best of `neighbours` starts each.
-    """
+def extend(ddp: DDP, bank: SolutionBank, x0: ArrayLike, neighbours: int = 3, t0: ArrayLike = 0.0,
+           p: Any = None) -> Solution:
+    """Solve new problems (x0 [B, nx], t0, p) from the nearest solutions of a bank: the best of `neighbours` starts."""
     if neighbours < 1:
         raise ValueError(f"neighbours is {neighbours}; expected at least 1")
     rows, _ = checks.states(x0, ddp.ocp.system.nx, ddp.ocp.system.name)
     best: Solution | None = None
-    for near in bank.nearest(rows, t0, count=neighbours).T:
-        solution = ddp.solve(rows, t0, **bank.guess(near, t0, rows))
+    values = ddp.ocp.parameters_of(p, len(rows), "extend") if ddp.ocp.np else None
+    for near in bank.nearest(rows, t0, count=neighbours, p=values).T:
+        solution = ddp.solve(rows, t0, p=values, **bank.guess(near, t0, rows))
         best = solution if best is None else better(best, solution)
     assert best is not None
     return best
@@ -205,6 +212,11 @@ def better(a: Solution, b: Solution) -> Solution:
     best.put(swap, b[swap])
     tried = None if a.tried is None or b.tried is None else np.c_[a.tried, b.tried]
     return replace(best, seconds=a.seconds + b.seconds, iterations=a.iterations + b.iterations, tried=tried)
+
+
+def _places(x: Array, p: Array | None) -> Array:
+    """States [B, nx] with their parameters [B, np], where there are some."""
+    return x if p is None else np.c_[x, p]
 
 
 def _solution(arrays: dict[str, Any]) -> Solution:

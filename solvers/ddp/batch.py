@@ -37,6 +37,7 @@ class Piece:
     t0: Array  # [n]
     guess: dict[str, Array]  # of u, x and gain, those that are given
     curvature: bool
+    p: Array | None = None  # [n, np]
 
     @property
     def size(self) -> int:
@@ -82,11 +83,13 @@ def bytes_each(ddp: Descent, curvature: bool) -> int:
     return 8 * (K + 1) * (4 * nx + 4 * nu + 2 * nu * nx + 3 + (nx * nx if curvature else 0))
 
 
-def pieces(ddp: Descent, x0: Array, t0: Array, guess: dict[str, Array], curvature: bool) -> list[Piece]:
+def pieces(ddp: Descent, x0: Array, t0: Array, guess: dict[str, Array], curvature: bool,
+           p: Array | None = None) -> list[Piece]:
     """Pieces of MOST problems, fewer where these would take more than BYTES; the same for any workers."""
     n = max(1, min(MOST, BYTES // bytes_each(ddp, curvature)))
-    return [Piece(f"piece-{i:09d}", i, x0[i:i + n], t0[i:i + n], {k: v[i:i + n] for k, v in guess.items()}, curvature)
-            for i in range(0, max(len(x0), 1), n)]
+    parts = (slice(i, i + n) for i in range(0, max(len(x0), 1), n))
+    return [Piece(f"piece-{at.start:09d}", at.start, x0[at], t0[at], {k: v[at] for k, v in guess.items()}, curvature,
+                  None if p is None else p[at]) for at in parts]
 
 
 def assembled(n: int, parts: Iterable[Solved]) -> Solution:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from nocl.data import Solution
@@ -41,8 +41,8 @@ CHECKPOINT = "search.safetensors"
 BYTES = 2**31  # guesses and answers that are held at a time, beside the best
 
 
-def solve_globally(ddp: DDP, x0: ArrayLike, *, starts: int = 16, neighbours: int = 4, rounds: int = 8, seed: Seed = 0,
-                   known: Solution | None = None, workers: int | str = "auto",
+def solve_globally(ddp: DDP, x0: ArrayLike, *, p: Any = None, starts: int = 16, neighbours: int = 4, rounds: int = 8,
+                   seed: Seed = 0, known: Solution | None = None, workers: int | str = "auto",
                    out: str | os.PathLike[str] | None = None, progress: bool | None = None,
                    report: OnMessage = lambda _: None) -> Solution:
     """Solve each problem from cold starts, then from its neighbours' solutions until nothing improves.
@@ -52,6 +52,7 @@ def solve_globally(ddp: DDP, x0: ArrayLike, *, starts: int = 16, neighbours: int
     Parameters
     ----------
     x0 : [nx] or [B, nx], at t0 = 0
+    p : parameters, where the problem has them: [np] for all, [B, np], or by name (OCP.parameters_of)
     starts : cold starts for each state, u held at u* the first of them
     neighbours, rounds : solutions of that many neighbours are tried, of one more in each round
     known : solutions from x0 to begin with; `starts` may be 0 then
@@ -63,16 +64,17 @@ def solve_globally(ddp: DDP, x0: ArrayLike, *, starts: int = 16, neighbours: int
     ValueError for wrong input; a state for which nothing converged has success False.
     """
     rows, _ = checks.states(x0, ddp.ocp.system.nx, ddp.ocp.system.name)
+    values = ddp.ocp.parameters_of(p, len(rows), "solve_globally")
     if min(starts + (known is not None), neighbours + 1, rounds + 1) < 1:
         raise ValueError(f"starts is {starts}, neighbours {neighbours}, rounds {rounds}; expected starts >= 1 (0 where "
                          "solutions are known), the others >= 0")
     number, folder = int(np.random.default_rng(seed).integers(2**62)), None if out is None else Path(out)
     key = "" if out is None else fingerprint(ddp.key, rows, number, (starts, neighbours, rounds),
-                                             *([] if known is None else [known.u]))
-    states = _States(ddp, rows, number, workers, folder, sys.stderr.isatty() if progress is None else progress)
+                                             *([] if known is None else [known.u]), *([values] if ddp.ocp.np else []))
+    states = _States(ddp, rows, values, number, workers, folder, sys.stderr.isatty() if progress is None else progress)
     t = np.linspace(0, ddp.ocp.horizon, ddp.intervals + 1)
     search = _Kept(states, mirrors(ddp.ocp, ddp.dynamics), t, folder, key, report, neighbours=neighbours,
-                   rounds=rounds, seed=number, known=known)
+                   rounds=rounds, seed=number, known=known, p=values)
     for start in range(starts):
         search.stage(f"cold start {start + 1} of {starts}", search.cold, np.arange(len(rows)), start, 1)
     search.improve(starts)
@@ -82,7 +84,7 @@ def solve_globally(ddp: DDP, x0: ArrayLike, *, starts: int = 16, neighbours: int
 def clean(ddp: DDP, bank: SolutionBank, **options: Any) -> SolutionBank:
     """A bank whose solutions were solved again from each other's until nothing improves; options of solve_globally."""
     known = bank.solution
-    found = solve_globally(ddp, known.x[:, 0], **{"starts": 0, **options}, known=known)
+    found = solve_globally(ddp, known.x[:, 0], p=known.p, **{"starts": 0, **options}, known=known)
     return SolutionBank.of(ddp, found)
 
 
@@ -99,8 +101,8 @@ class GlobalDDP:
         return self.ddp.substeps
 
     def solve(self, x0: ArrayLike, workers: int | str = "auto", out: str | os.PathLike[str] | None = None,
-              progress: bool | None = None) -> Solution:
-        return solve_globally(self.ddp, x0, starts=self.starts, seed=self.seed, workers=workers, out=out,
+              progress: bool | None = None, p: Any = None) -> Solution:
+        return solve_globally(self.ddp, x0, p=p, starts=self.starts, seed=self.seed, workers=workers, out=out,
                               progress=progress)
 
 
@@ -167,8 +169,10 @@ class _Kept(Search):
 class _States:
     """The states of one call, as a search asks for them: batches as large as fit, each with a folder of its own."""
 
-    def __init__(self, ddp: DDP, x0: Array, seed: int, workers: int | str, out: Path | None, show: bool) -> None:
-        self.ddp, self.x0, self.seed, self.workers, self.folder, self.show = ddp, x0, seed, workers, out, show
+    def __init__(self, ddp: DDP, x0: Array, p: Array, seed: int, workers: int | str, out: Path | None,
+                 show: bool) -> None:
+        self.ddp, self.x0, self.p, self.seed, self.workers, self.folder, self.show = \
+            ddp, x0, p, seed, workers, out, show
 
     @cached_property
     def holds(self) -> Holds:
@@ -191,18 +195,19 @@ class _States:
         if number == 0:
             return {}
         if number == 1:
-            return self.holds.goal(n)
+            return self.holds.goal(self.p[rows[at]])
         if number % 2:
-            return self._tamed(rows[at], {"u": random_controls(ddp.ocp, ddp.intervals, n, rng)})
-        return self._tamed(rows[at], self.holds.random(n, rng))
+            return self._tamed(rows[at], {"u": random_controls(ddp.ocp, ddp.intervals, n, rng, self.p[rows[at]])})
+        return self._tamed(rows[at], self.holds.random(self.p[rows[at]], rng))
 
     def _tamed(self, states: Rows, guess: Guess) -> Guess:
         """A guess, its controls moved towards u* until the rollout stays near X."""
-        goal, rows = np.asarray(self.ddp.ocp.u_goal), np.arange(len(states))
+        goal, rows = self.ddp.ocp.goals(self.p[states])[1][:, None], np.arange(len(states))
         for _ in range(HALVINGS):
-            x = self.ddp.rollout(self.x0[states[rows]], **{name: value[rows] for name, value in guess.items()})
+            some = {name: value[rows] for name, value in guess.items()}
+            x = self.ddp.rollout(self.x0[states[rows]], self.p[states[rows]], **some)
             rows = rows[~near(self.ddp.ocp.system, x)]
-            guess["u"][rows] = (guess["u"][rows] + goal) / 2
+            guess["u"][rows] = (guess["u"][rows] + goal[rows]) / 2
         return guess
 
     def _solve(self, rows: Rows, guess: Callable[[slice], Guess]) -> Found:
@@ -213,60 +218,107 @@ class _States:
             for at in (slice(i, i + n) for i in range(0, len(rows), n)):
                 self.slices += 1
                 folder = None if self.folder is None else self.folder / f"stage-{self.number:03d}-{self.slices:05d}"
-                yield rows[at], self.ddp.solve(self.x0[rows[at]], **guess(at), workers=self.workers, out=folder,
+                p = self.p[rows[at]] if self.ddp.ocp.np else None
+                yield rows[at], self.ddp.solve(self.x0[rows[at]], p=p, **guess(at), workers=self.workers, out=folder,
                                                progress=self.show and len(rows) <= n)
                 bar.update(len(rows[at]))
 
 
 class Holds:
-    """Starts that hold equilibria: f = 0 in X and U, the goal first, under the feedback of one sweep about each."""
+    """Starts that hold equilibria: f = 0 in X and U, the goal first, under the feedback of one sweep about each.
+
+    Without parameters the same few for all states. With them each state has its own: its goal, and one other.
+    """
 
     def __init__(self, ddp: DDP, rng: np.random.Generator) -> None:
-        self.ddp, K, nx = ddp, ddp.intervals, ddp.ocp.system.nx
-        z = equilibria(ddp.ocp, DRAWS, rng, ddp.dynamics)
-        self.x, self.u = np.repeat(z[:, None, :nx], K + 1, axis=1), np.repeat(z[:, None, nx:], K, axis=1)
-        self.gain = ddp.feedback(self.x, self.u)
+        self.ddp = ddp
+        if not ddp.ocp.np:
+            z = equilibria(ddp.ocp, DRAWS, rng, ddp.dynamics)
+            self.x, self.u = self._everywhere(z)
+            self.gain = ddp.feedback(self.x, self.u)
 
-    def goal(self, n: int) -> dict[str, Array]:
-        """The goal held, n times."""
-        rows = np.zeros(n, dtype=np.int64)
+    def goal(self, p: Array) -> Guess:
+        """The goal held, for parameters p [n, np]."""
+        if self.ddp.ocp.np:
+            return self._own(np.column_stack(self.ddp.ocp.goals(p)), p)
+        rows = np.zeros(len(p), dtype=np.int64)
         return {"u": self.u[rows], "x": self.x[rows], "gain": self.gain[rows]}
 
-    def random(self, n: int, rng: np.random.Generator) -> dict[str, Array]:
+    def random(self, p: Array, rng: np.random.Generator) -> Guess:
         """Smooth random controls until a random time; a hold, of the goal or another equilibrium, from there or from
-        the start on."""
-        K, s = self.ddp.intervals, self.ddp.ocp.system
-        rows = np.where(rng.random(n) < 0.5, 0, rng.integers(0, len(self.x), n))
+        the start on. For parameters p [n, np]."""
+        K, s, n = self.ddp.intervals, self.ddp.ocp.system, len(p)
+        hold = self._any(p, rng)
         ends, always = rng.uniform(0, 0.8 * K, (n, 1)), rng.random((n, 1)) < 0.5
         moving = np.arange(K) < ends
-        u = self.u[rows] + np.where(moving[..., None], smooth(s, K, n, rng), 0.0)
-        gain = np.where((~moving | always)[..., None, None], self.gain[rows], 0.0)
-        return {"u": np.clip(u, s.lbu, s.ubu), "x": self.x[rows], "gain": gain}
+        u = hold["u"] + np.where(moving[..., None], smooth(s, K, n, rng), 0.0)
+        gain = np.where((~moving | always)[..., None, None], hold["gain"], 0.0)
+        return {"u": np.clip(u, s.lbu, s.ubu), "x": hold["x"], "gain": gain}
+
+    def _any(self, p: Array, rng: np.random.Generator) -> Guess:
+        """The goal, or another equilibrium, as often."""
+        n, ocp = len(p), self.ddp.ocp
+        if not ocp.np:
+            rows = np.where(rng.random(n) < 0.5, 0, rng.integers(0, len(self.x), n))
+            return {"u": self.u[rows], "x": self.x[rows], "gain": self.gain[rows]}
+        z = np.column_stack(ocp.goals(p))
+        others, found = settled(ocp, draws(ocp, n, rng), p, self.ddp.dynamics)
+        other = found & (rng.random(n) < 0.5)
+        return self._own(np.where(other[:, None], others, z), p)
+
+    def _own(self, z: Array, p: Array) -> Guess:
+        x, u = self._everywhere(z)
+        return {"u": u, "x": x, "gain": self.ddp.feedback(x, u, p)}
+
+    def _everywhere(self, z: Array) -> tuple[Array, Array]:
+        """Points (x, u) [n, nx + nu] as trajectories."""
+        K, nx = self.ddp.intervals, self.ddp.ocp.system.nx
+        return np.repeat(z[:, None, :nx], K + 1, axis=1), np.repeat(z[:, None, nx:], K, axis=1)
 
 
-def equilibria(ocp: OCP, draws: int, rng: np.random.Generator, dynamics: Any = None) -> Array:
+def equilibria(ocp: OCP, number: int, rng: np.random.Generator, dynamics: Any = None) -> Array:
     """(x*, u*), then points of X and U where f = 0, by Gauss-Newton steps from random ones [n, nx + nu]."""
-    s = ocp.system
     goal = np.r_[ocp.x_goal, ocp.u_goal][None]
-    if s.xdot is None and dynamics is None:  # a plant that is not known: no other equilibria are
+    if ocp.system.xdot is None and dynamics is None:  # a plant that is not known: no other equilibria are
         return goal
+    z, found = settled(ocp, draws(ocp, number, rng), np.zeros((number, 0)), dynamics)
+    return np.vstack([goal, z[found]])
+
+
+def draws(ocp: OCP, n: int, rng: np.random.Generator) -> Array:
+    """n random points of X and U [n, nx + nu]."""
+    s = ocp.system
+    low = np.r_[s.lbx, s.lbu]
+    return rng.uniform(low, np.r_[s.ubx, s.ubu], (n, len(low)))
+
+
+def settled(ocp: OCP, z: Array, p: Array, dynamics: Any = None) -> tuple[Array, NDArray[np.bool_]]:
+    """z [n, nx + nu] after Gauss-Newton steps to f = 0 at t = 0 and p [n, np], and where it is such a point of X and U.
+    """
+    s, z, fine = ocp.system, z.copy(), np.ones(len(z), dtype=bool)
+    if s.xdot is None and dynamics is None:
+        return z, ~fine
     low, high = np.r_[s.lbx, s.lbu], np.r_[s.ubx, s.ubu]
     of, half = ocp.functions.on(dynamics_function(ocp, dynamics)), (high - low) / 2
     rate = half[:s.nx] / ocp.horizon  # what 1 stands for in f; half the box in z
 
-    def linear(z: Array) -> tuple[Array, Array]:
-        x, u = np.split(z.T, [s.nx])
-        AB = (j.full().reshape(s.nx, len(z), -1) for j in of.jacobian.map(len(z))(x, u))
+    def linear(rows: Rows) -> tuple[Array, Array]:
+        x, u = np.split(z[rows], [s.nx], axis=1)
+        at = of.arguments.columns(x=x, u=u, t=np.zeros(len(rows)), p=p[rows])
+        AB = (j.full().reshape(s.nx, len(rows), -1) for j in of.jacobian.map(len(rows))(*at))
         J = np.concatenate(list(AB), axis=2).transpose(1, 0, 2)
-        return of.f.map(len(z))(x, u).full().T / rate, J / rate[:, None] * half
+        return of.f.map(len(rows))(*at).full().T / rate, J / rate[:, None] * half
 
-    z = rng.uniform(low, high, (draws, len(low)))
     for _ in range(NEWTON):
-        if not len(z):
-            return goal
-        value, J = linear(z)
-        fine = np.isfinite(value).all(axis=1) & np.isfinite(J).all(axis=(1, 2))
-        z = z[fine] - half * np.einsum("bij,bj->bi", np.linalg.pinv(J[fine], rcond=1e-8), value[fine])
-    inside = (z >= low).all(axis=1) & (z <= high).all(axis=1)
-    still = np.abs(linear(z)[0]).max(axis=1) < 1e-8 if len(z) else inside
-    return np.vstack([goal, z[inside & still]])
+        rows = np.flatnonzero(fine)
+        if not len(rows):
+            return z, fine
+        value, J = linear(rows)
+        good = np.isfinite(value).all(axis=1) & np.isfinite(J).all(axis=(1, 2))
+        fine[rows[~good]] = False
+        z[rows[good]] -= half * np.einsum("bij,bj->bi", np.linalg.pinv(J[good], rcond=1e-8), value[good])
+    rows = np.flatnonzero(fine)
+    inside = (z[rows] >= low).all(axis=1) & (z[rows] <= high).all(axis=1)
+    still = np.abs(linear(rows)[0]).max(axis=1) < 1e-8 if len(rows) else inside
+    fine[rows] = inside & still
+    return z, fine

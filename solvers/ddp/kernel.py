@@ -42,23 +42,26 @@ def ddp_source(ocp: OCP, net: Any = None, substeps: int = 1) -> str:
     substeps : Runge-Kutta steps in each interval
     """
     at = ocp.functions.stage
-    stage = _Derivatives(at, net)
+    stage, inputs = _Derivatives(at, net), stage_inputs(at)
     nets, networks, n, m = stage.nets, stage.networks, ocp.system.nx, ocp.system.nu
     sizes = {"N": n, "M": m, "NET": networks.numel(), "TAPE": sum(n.tape for n in nets),
              "NV": stage.v.numel(), "BEND": stage.bend.numel(), "NJ": stage.J.nnz(), "NW": stage.W.nnz(),
              "SUBSTEPS": substeps}
+    if "d" in inputs:
+        sizes |= {"ND": inputs["d"].numel(), "TIMED": int("t" in at.names), "NP": ocp.np}
+    moment = list(inputs.values())
     lines = ['#include "lanes.h"', *(['#include "mlp.h"'] if nets else []),
              *(f"#define {name} {value}" for name, value in sizes.items()),
              f"static const double DAMPED[M] = {{{', '.join(map(repr, damped(ocp).tolist()))}}};", _STEP,
-             _networks(at, nets),
-             emit("field", [*at.inputs, networks], [ca.densify(stage.rhs)]),
-             emit("stage_jacobian", [*at.inputs, networks], [stage.J.T]),
-             emit("network_weights", [*at.inputs, networks, stage.mu], [stage.v]),
-             emit("stage_hessian", [*at.inputs, networks, stage.bend, stage.mu], [stage.W]),
+             _networks(inputs, nets),
+             emit("field", [*moment, networks], [ca.densify(stage.rhs)]),
+             emit("stage_jacobian", [*moment, networks], [stage.J.T]),
+             emit("network_weights", [*moment, networks, stage.mu], [stage.v]),
+             emit("stage_hessian", [*moment, networks, stage.bend, stage.mu], [stage.W]),
              _chain(n, m, stage.J.sparsity(), stage.W.sparsity())]
-    end = ocp.functions.end
-    lines.append(emit("terminal", end.inputs, end.call(ocp.functions.G_derivatives)))
-    lines.append('#include "ddp.h"\n')
+    if ocp.np:
+        lines.append(emit("stage_parameters", [*moment, networks, stage.bend, stage.mu], [stage.by_p]))
+    lines += [*_terminal(ocp, inputs), '#include "ddp.h"\n']
     return "\n".join(lines)
 
 
@@ -68,13 +71,29 @@ def damped(ocp: OCP) -> Array:
     return of.cost / of.u**2
 
 
+def stage_inputs(at: Stage) -> dict[str, ca.SX]:
+    """What the kernel's functions of a stage are functions of: x, u and, with time or parameters, d = (t, p)."""
+    data = at.but("x", "u").inputs
+    return {"x": at.x, "u": at.u, **({"d": ca.vertcat(*data)} if data else {})}
+
+
+def _terminal(ocp: OCP, inputs: dict[str, ca.SX]) -> list[str]:
+    """terminal() and, with parameters, terminal_parameters()."""
+    end, given = ocp.functions.end, [value for name, value in inputs.items() if name != "u"]
+    lines = [emit("terminal", given, end.call(ocp.functions.G_derivatives))]
+    if ocp.np:
+        slope = ca.densify(ca.gradient(end.call(ocp.functions.G), end["p"]))
+        lines.append(emit("terminal_parameters", given, [slope]))
+    return lines
+
+
 class _Net:
     """One network as symbols: values and slopes along q directions; Hessian and adjoint for weights on the values.
 
     The directions are the variables in z that its features depend on, or the features where those are fewer.
     """
 
-    def __init__(self, mlp: Any, phi: ca.SX, z: ca.SX, number: int) -> None:
+    def __init__(self, mlp: Any, phi: ca.SX, z: ca.SX, p: ca.SX, number: int) -> None:
         self.mlp, self.phi, out = mlp, ca.densify(phi), mlp.sizes[-1]
         slopes = ca.jacobian(phi, z)
         variables = sorted(set(slopes.sparsity().get_triplet()[1]))
@@ -89,6 +108,7 @@ class _Net:
         H, s = ca.SX.sym(f"H{number}", q * (q + 1) // 2), ca.SX.sym(f"s{number}", phi.numel())
         self.bend = ca.vertcat(H, s)
         through = ca.hessian(ca.dot(s, phi), z)[0]
+        self.by_p = ca.jacobian(phi, p).T @ s  # of v'y, v fixed
         self.hessian = along.T @ _symmetric(q, ca.vertsplit(H)) @ along + through  # of v'y in z, v fixed
         self.tape = (q + 2) * sum(mlp.sizes[1:-1])
         self.weights = sum((a + 1) * b for a, b in pairwise(mlp.sizes)) + (mlp.skip is not None) * phi.numel() * out
@@ -103,16 +123,19 @@ def _symmetric(q: int, upper: Columns) -> ca.SX:
 
 
 class _Derivatives:
-    """(xdot, L) at a stage, its Jacobian and the weighted Hessian's lower triangle, with the networks as symbols."""
+    """(xdot, L) at a stage, its Jacobian, the weighted Hessian's lower triangle and gradient by p; networks as symbols.
+    """
 
     def __init__(self, at: Stage, net: Any) -> None:
         z, self.mu = at.z, ca.SX.sym("mu", at.x.numel() + 1)
-        phi = net.inputs.call(at.inputs) if net is not None and net.nets else []
+        p = at["p"] if "p" in at.names else ca.SX(0, 1)
+        given = [] if net is None else at.of_system[:net.inputs.n_in()]
+        phi = net.inputs.call(given) if net is not None and net.nets else []
         nets = zip(net.nets, phi, strict=True) if phi else ()
-        self.nets = [_Net(mlp, p, z, i) for i, (mlp, p) in enumerate(nets)]
+        self.nets = [_Net(mlp, features, z, p, i) for i, (mlp, features) in enumerate(nets)]
         self.networks = ca.vertcat(*(ca.vec(n.symbols) for n in self.nets))
         self.bend = ca.vertcat(*(n.bend for n in self.nets))
-        xdot = at.xdot if net is None else net.outputs(*at.inputs, *(n.y for n in self.nets))
+        xdot = at.xdot if net is None else net.outputs(*given, *(n.y for n in self.nets))
         self.rhs = ca.vertcat(xdot, at.L_soft)
         y, yz = ca.vertcat(*(n.y for n in self.nets)), ca.vertcat(*(n.slopes for n in self.nets))
         self.J, scalar = ca.jacobian(self.rhs, z), ca.dot(self.mu, self.rhs)
@@ -123,6 +146,8 @@ class _Derivatives:
             cross = ca.jacobian(ca.gradient(scalar, z), y) @ yz
             H = H + cross + cross.T + yz.T @ Hyy @ yz + sum(n.hessian for n in self.nets)
         self.v, self.W = ca.densify(self.v), ca.tril(H)
+        by_p = ca.gradient(scalar, p) if p.numel() else p
+        self.by_p = ca.densify(by_p + sum(n.by_p for n in self.nets))
 
 
 def _chain(n: int, m: int, J: ca.Sparsity, W: ca.Sparsity) -> str:
@@ -192,15 +217,16 @@ def _straight_chain(n: int, m: int, J_pattern: ca.Sparsity, W_pattern: ca.Sparsi
             emit("step_derivatives", [Js, Ws, h], [ca.densify(F.T), ca.densify(cost), ca.densify(H)])]
 
 
-def _networks(at: Stage, nets: Sequence[_Net]) -> str:
+def _networks(inputs: dict[str, ca.SX], nets: Sequence[_Net]) -> str:
     """C of network_values(), network_slopes() and network_bend(): features by generated code, then each MLP."""
-    given, parameters = ", ".join(at.names), "".join(f"const lane *{name}, " for name in at.names)
+    given, parameters = ", ".join(inputs), "".join(f"const lane *{name}, " for name in inputs)
+    moment = list(inputs.values())
     values, slopes, bend = _Body(), _Body(), _Body()
     emitted, weight, net, tape, v, bent = [], 1, 0, 0, 0, 0
     for g, n in enumerate(nets):
         d, C, sizes = n.phi.numel(), n.q + 1, n.mlp.sizes
-        emitted += [emit(f"features{g}", at.inputs, [n.phi]),
-                    emit(f"seeds{g}", at.inputs, [ca.vec(ca.horzcat(n.phi, n.seeds).T)])]
+        emitted += [emit(f"features{g}", moment, [n.phi]),
+                    emit(f"seeds{g}", moment, [ca.vec(ca.horzcat(n.phi, n.seeds).T)])]
         widest, skip = max(sizes), int(n.mlp.skip is not None)
         shape = f"{{{', '.join(map(str, sizes))}}}"
         common = f"weights + {weight}, (const int[]){shape}, {len(sizes) - 1}"

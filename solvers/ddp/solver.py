@@ -1,8 +1,8 @@
 """Batched control-limited differential dynamic programming with exact second derivatives, in C generated from CasADi.
 
 Notation: z = (x, u); K RK4 intervals on [t0, T], u held on each, as NMPC has it; a problem of the batch is a pair
-(x0, t0). V, V_x, V_xx are the cost-to-go at the nodes and its derivatives, u + gain (x' - x) is the locally optimal
-feedback.
+(x0, t0), with parameters p where the problem has some: data, no states. V, V_x, V_xx are the cost-to-go at the nodes
+and its derivatives, u + gain (x' - x) is the locally optimal feedback.
 
 Sources: Jacobson and Mayne, Differential Dynamic Programming (1970); Tassa, Mansard and Todorov, Control-limited
 differential dynamic programming, ICRA 2014.
@@ -28,12 +28,11 @@ from numpy.typing import ArrayLike
 from nocl.data import Solution
 from nocl.functions import Functions
 from nocl.ocp import OCP
-from nocl.sampling import own_numbers
 from nocl.scales import usual_sizes
 from nocl.solvers.ddp.batch import Job, Piece, Rows, assembled, pieces
 from nocl.solvers.ddp.kernel import ddp_source, pack_weights
 from nocl.solvers.ddp.without_compiler import ddp_kernel
-from nocl.solvers.grid import ROWS, fastest_at_start, measured
+from nocl.solvers.grid import fastest_at_start, firsts, measured
 from nocl.substeps import COARSE, Grid, settled
 from nocl.support import checks
 from nocl.support.checks import Array
@@ -122,14 +121,16 @@ class DDP:
         DDP.__init__(self, **options)  # the kernel is built, or found in the cache, where it is needed
 
     def solve(self, x0: ArrayLike, t0: ArrayLike = 0.0, *, u: Array | None = None, x: Array | None = None,
-              gain: Array | None = None, curvature: bool = False, workers: int | str = "auto",
-              out: str | os.PathLike[str] | None = None, progress: bool | None = None) -> Solution:
+              gain: Array | None = None, p: Any = None, curvature: bool = False,
+              workers: int | str = "auto", out: str | os.PathLike[str] | None = None,
+              progress: bool | None = None) -> Solution:
         """Descend from a guess u [B, K, nu] (default u*), followed with u + gain (x' - x) where x and gain are given.
 
         Parameters
         ----------
         x0 : [nx] or [B, nx]
         t0 : number or [B], each < horizon
+        p : parameters, where the problem has them: [np] for all, [B, np], or by name (OCP.parameters_of)
         curvature : whether to return V_xx
         workers : "auto" (this process, `threads` of it), a number of threads, or "tcp://...", a Dask scheduler
         out : a folder that gets each piece of the batch as soon as it is solved: the same call resumes what is there
@@ -141,13 +142,14 @@ class DDP:
         """
         rows, _ = checks.states(x0, self.ocp.system.nx, self.ocp.system.name)
         rows = np.ascontiguousarray(rows)
+        values = self.ocp.parameters_of(p, len(rows), "DDP")
         curvature = checks.flag(curvature, "curvature", "DDP.solve")
         times, (pool, here) = self._start_times(t0, len(rows)), self._where(workers)
         guess = self._guesses(len(rows), u=u, x=x, gain=gain)
-        journal = Journal(None if out is None else Path(out), self._run_key(rows, times, guess, curvature) if out
-                          else "", "DDP")
+        journal = Journal(None if out is None else Path(out),
+                          self._run_key(rows, times, values, guess, curvature) if out else "", "DDP")
         show = sys.stderr.isatty() if progress is None else progress
-        tasks = pieces(self, rows, times, guess, curvature)
+        tasks = pieces(self, rows, times, guess, curvature, values)
         solution = assembled(len(rows), stream(Job(here), tasks, pool, journal, show, f"DDP, {self.ocp.system.name}"))
         self._check_grid(solution)
         return solution
@@ -163,21 +165,25 @@ class DDP:
 
     def descend(self, batch: Piece) -> Solution:
         """Solve one piece of a batch, here."""
-        work = Work(self, batch.x0, batch.t0, *(batch.guess.get(name) for name in ("u", "x", "gain")))
+        given = batch.guess.get
+        work = Work(self, batch.x0, batch.t0, given("u"), given("x"), given("gain"), batch.p)
         work.descend()
         return work.solution(batch.curvature)
 
-    def rollout(self, x0: Array, **guess: Array) -> Array:
-        """The states [B, K+1, nx] from x0 [B, nx] at t0 = 0 under a guess of `solve`'s: where the descent begins."""
-        given = self._guesses(len(x0), **guess)
-        work = Work(self, np.ascontiguousarray(x0), np.zeros(len(x0)), *(given.get(k) for k in ("u", "x", "gain")))
+    def rollout(self, x0: Array, p: Array | None = None, **guess: Array) -> Array:
+        """The states [B, K+1, nx] from x0 [B, nx] at t0 = 0 under a guess of `solve`'s: where the descent begins.
+
+        p [B, np], where the problem has parameters.
+        """
+        given = self._guesses(len(x0), **guess).get
+        work = Work(self, np.ascontiguousarray(x0), np.zeros(len(x0)), given("u"), given("x"), given("gain"), p)
         return work.x
 
-    def feedback(self, x: Array, u: Array) -> Array:
+    def feedback(self, x: Array, u: Array, p: Array | None = None) -> Array:
         """Gains [B, K, nu, nx] of one sweep about x [B, K+1, nx], u [B, K, nu]: those of the OCP's cost, damped until
-        it is convex there; 0 where no damping helps."""
+        it is convex there; 0 where no damping helps. p [B, np], where the problem has parameters."""
         B, s = len(x), self.settings
-        work = Work(self, np.ascontiguousarray(x[:, 0]), np.zeros(B), None, None, None)
+        work = Work(self, np.ascontiguousarray(x[:, 0]), np.zeros(B), None, None, None, p)
         work.x[:], work.u[:] = x, u
         rows = np.arange(B)
         while rows.size:
@@ -212,9 +218,10 @@ class DDP:
         return fingerprint(self.ocp.to_data(), ddp_source(self.ocp, net, self.substeps), self._weights,
                            self.intervals, self.settings, self.constraints, version("nocl"))
 
-    def _run_key(self, x0: Array, t0: Array, guess: dict[str, Array], curvature: bool) -> str:
+    def _run_key(self, x0: Array, t0: Array, p: Array, guess: dict[str, Array], curvature: bool) -> str:
         """A fingerprint of all that the solution depends on."""
-        return fingerprint(self.key, x0, t0, *(part for pair in sorted(guess.items()) for part in pair), curvature)
+        return fingerprint(self.key, x0, t0, *([p] if p.size else []),
+                           *(part for pair in sorted(guess.items()) for part in pair), curvature)
 
     def _start_times(self, t0: ArrayLike, B: int) -> Array:
         given = checks.numeric(t0, "t0", "DDP.solve", f"a number, or one for each of the {B} states")
@@ -230,12 +237,12 @@ class DDP:
 @lru_cache(maxsize=32)
 def substeps_for(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int, tolerance: float = COARSE) -> int:
     """As many as solutions from a few initial states ask for, so that they are off by `tolerance` at most."""
-    functions, x0 = _functions(ocp, dynamics), ocp.initial_states.sample(ROWS, own_numbers(0))
+    functions, (x0, p) = _functions(ocp, dynamics), firsts(ocp)
 
     def ask(substeps: int) -> Grid | None:
         ddp = DDP(ocp, intervals=intervals, substeps=substeps, dynamics=dynamics, constraints="soft")
         ddp.checked = True
-        return measured(ocp, functions, ddp.solve(x0, progress=False), substeps)
+        return measured(ocp, functions, ddp.solve(x0, p=p, progress=False), substeps)
 
     return settled(f"DDP of {ocp.system.name}", ask, ocp.horizon / intervals, lambda: fastest_at_start(ocp, functions),
                    tolerance)
@@ -255,6 +262,7 @@ class Work:
     guess_u: Array | None
     guess_x: Array | None
     guess_gain: Array | None
+    parameters: Array | None = None  # [B, np], where the problem has some
     mu: Array = field(init=False)
 
     def __post_init__(self) -> None:
@@ -262,6 +270,7 @@ class Work:
         self.rounding = ROUNDING * usual_sizes(self.ddp.ocp).cost
         ocp, B, K = self.ddp.ocp, len(self.x0), self.ddp.intervals
         nx, nu = ocp.system.nx, ocp.system.nu
+        self.p = np.zeros((B, 0)) if self.parameters is None else self.parameters
         self.h = (ocp.horizon - self.t0) / K
         self.x, self.u = np.zeros((B, K + 1, nx)), np.zeros((B, K, nu))
         self.k, self.gain = np.zeros((B, K, nu)), np.zeros((B, K, nu, nx))
@@ -270,7 +279,9 @@ class Work:
         self.mu, self.alpha, self.iterations = np.zeros(B), np.zeros(B), np.zeros(B, dtype=np.int64)
         self.state = np.zeros(B, dtype=np.int64)  # an index of MESSAGES
         self.refused = np.full(B, -1.0)  # the largest mu at which the last sweep's trajectory was not convex
-        u = np.broadcast_to(ocp.u_goal, (B, K, nu)).copy() if self.guess_u is None else self.guess_u
+        timed = [self.t0] if ocp.uses_time else []
+        self.data = [np.column_stack([*timed, self.p])] if timed or ocp.np else []  # what the kernel calls d_
+        u = np.repeat(ocp.goals(self.p)[1][:, None], K, axis=1) if self.guess_u is None else self.guess_u
         x = self.x if self.guess_x is None else self.guess_x
         gain = self.gain if self.guess_gain is None else self.guess_gain
         self.rollout(np.arange(B), x, u, gain)
@@ -280,15 +291,17 @@ class Work:
     def rollout(self, rows: Rows, x_bar: Array, u_bar: Array, gain: Array) -> None:
         d = self.ddp
         d.evaluations["rollout"] += STAGES * d.substeps * d.intervals * len(rows)
-        d.kernel("nocl_rollout", rows, d.intervals, d._weights, d._lb, d._ub, self.h, self.x0, x_bar, u_bar, self.k,
-                 gain, self.alpha, self.new_x, self.new_u, self.new_J, threads=d.threads)
+        d.kernel("nocl_rollout", rows, d.intervals, d._weights, d._lb, d._ub, self.h, *self.data, self.x0, x_bar, u_bar,
+                 self.k, gain, self.alpha, self.new_x, self.new_u, self.new_J, threads=d.threads)
 
-    def backward(self, rows: Rows, V: Array | None = None, V_x: Array | None = None,
-                  V_xx: Array | None = None) -> None:
+    def backward(self, rows: Rows, V: Array | None = None, V_x: Array | None = None, V_xx: Array | None = None,
+                 V_p: Array | None = None) -> None:
         d = self.ddp
         d.evaluations["backward"] += STAGES * d.substeps * d.intervals * len(rows)  # with first and second derivatives
-        d.kernel("nocl_backward", rows, d.intervals, d._weights, d._lb, d._ub, self.h, self.x, self.u, self.mu, self.k,
-                  self.gain, self.slope, self.curve, self.positive, V, V_x, V_xx, threads=d.threads)
+        by_p = [V_p] if self.data else []
+        d.kernel("nocl_backward", rows, d.intervals, d._weights, d._lb, d._ub, self.h, *self.data, self.x, self.u,
+                 self.mu, self.k, self.gain, self.slope, self.curve, self.positive, V, V_x, V_xx, *by_p,
+                 threads=d.threads)
 
     def descend(self) -> None:
         s = self.ddp.settings
@@ -356,16 +369,18 @@ class Work:
         V, V_x = np.zeros((B, K + 1)), np.zeros((B, K + 1, nx))
         V_xx = np.zeros((B, K + 1, nx, nx)) if curvature else None
         self.mu[:] = 0
-        self.backward(np.arange(B), V, V_x, V_xx)
+        known = {"p": self.p, "V_p": np.zeros_like(self.p)} if self.ddp.ocp.np else {}
+        self.backward(np.arange(B), V, V_x, V_xx, known.get("V_p"))
         t = self.t0[:, None] + self.h[:, None] * np.arange(K + 1)
         message = [self._words(int(state)) for state in self.state]
         for i, why in self._violations(t):
             self.state[i], message[i] = VIOLATED, why
         success = self.state == CONVERGED
         seconds = np.full(B, (time.perf_counter() - self.begin) / max(B, 1))
-        clearance = self.ddp.ocp.least(self.x).min(axis=1, initial=np.inf)
+        clearance = self.ddp.ocp.least(self.x, t, self.p).min(axis=1, initial=np.inf)
         return Solution(t, self.x, self.u, self.gain, V, V_x, np.where(success, self.J, np.inf), success,
-                        np.array(message, dtype=np.str_), seconds, self.iterations, V_xx, clearance=clearance)
+                        np.array(message, dtype=np.str_), seconds, self.iterations, V_xx, clearance=clearance,
+                        **known)
 
     def _words(self, state: int) -> str:
         kinks = self.ddp.ocp.not_smooth if state in (OUT_OF_ITERATIONS, NO_DESCENT, NOT_CONVEX) else ""
@@ -376,9 +391,9 @@ class Work:
         ocp = self.ddp.ocp
         if self.ddp.constraints == "soft" or not ocp.path_constraints:
             return
-        over = ocp.violation(ocp.least(self.x)) > TOLERATED
+        over = ocp.violation(ocp.least(self.x, t, self.p)) > TOLERATED
         for i in np.flatnonzero((self.state == CONVERGED) & over):
-            h = ocp.h(self.x[i].T).full()
+            h = ocp.h(*ocp.functions.node.columns(x=self.x[i], t=t[i], p=self.p[i])).full()
             k, node = np.unravel_index(np.argmin(h / ocp.constraint_scales[:, None]), h.shape)
             why = "by the initial state itself: move it" if node == 0 else CROSSED
             yield int(i), (f"path constraint {list(ocp.path_constraints)[k]!r} is violated by {-h[k, node]:.3g} at "
@@ -398,7 +413,7 @@ def _fitting(ocp: OCP, dynamics: LearnedDynamics) -> Any:
     if not hasattr(dynamics, "net"):
         raise ValueError(f"DDP: dynamics is a {type(dynamics).__name__}; expected LearnedDynamics, as "
                          "nocl.identify gives it, or None for the exact f")
-    ours, theirs = ocp.system.names, dynamics.system.names
+    ours, theirs = ((*s.names, *s.parameter_names) for s in (ocp.system, dynamics.system))
     if ours != theirs:
         raise ValueError(f"DDP: dynamics was learned for {', '.join(theirs)}; the problem has {', '.join(ours)}")
     return dynamics.net

@@ -47,37 +47,55 @@ class NumpyKernel:
     def __init__(self, ocp: OCP, dynamics: Any = None, substeps: int = 1) -> None:
         of = ocp.functions if dynamics is None else ocp.functions.on(dynamics.to_casadi())
         at, self.shape = of.stage, (ocp.system.nx, ocp.system.nu)
+        self.np, self.timed, self.end = ocp.np, ocp.uses_time, of.end
+        self.has_data = bool(self.np or self.timed)
         h, lam = at.sym("h"), at.sym("lam", ocp.system.nx)
         after, cost = at.interval(h, substeps=substeps)
         H, g = ca.hessian(ca.dot(lam, after) + cost, at.z)[0], ca.gradient(cost, at.z)
         self.damped = np.diag(damped(ocp))
         self._step, self._terminal = of.step(substeps=substeps), of.G_derivatives
-        self._slopes = at.function("slopes", {"cost": cost, "F_z": ca.jacobian(after, at.z), "cost_z": g, "Q_zz": H},
-                                   h=h, lam=lam)
+        by_p = {"Q_p": ca.gradient(ca.dot(lam, after) + cost, at["p"])} if self.np else {}
+        self._slopes = at.function("slopes", {"cost": cost, "F_z": ca.jacobian(after, at.z), "cost_z": g, "Q_zz": H,
+                                              **by_p}, h=h, lam=lam)
+        if self.np:
+            slope = ca.gradient(of.end.call(of.G), of.end["p"])
+            self._terminal_by_p = of.end.function("terminal_by_p", {"G_p": slope})
 
     def __call__(self, name: str, problems: Rows, *args: Any, threads: int = 1) -> None:
         """Run "nocl_rollout" or "nocl_backward" on the given problem numbers; threads play no part."""
         if len(problems):
             with np.errstate(all="ignore"):  # what is not finite stays in its row, and is found there
                 run = self._rollout if name == "nocl_rollout" else self._backward
-                run(problems, *args)
+                first, more = list(args[:5]), list(args[5:])  # K, weights, lb, ub, h, then the data where there are any
+                data = more.pop(0)[problems] if self.has_data else np.zeros((len(problems), 0))
+                run(problems, data, *first, *more)
 
-    def _rollout(self, b: Rows, K: int, weights: Array, lb: Array, ub: Array, h: Array, x0: Array, x_bar: Array,
-                 u_bar: Array, k: Array, gain: Array, alpha: Array, x: Array, u: Array, J: Array) -> None:
+    def _moment(self, d: Array, after: Array) -> list[Array]:
+        """[t] and [p], those that the problem has, a time after the start."""
+        t = [d[:, :1] + after[:, None]] if self.timed else []
+        return [*t, *([d[:, self.timed:]] if self.np else [])]
+
+    def _rollout(self, b: Rows, d: Array, K: int, weights: Array, lb: Array, ub: Array, h: Array, x0: Array,
+                 x_bar: Array, u_bar: Array, k: Array, gain: Array, alpha: Array, x: Array, u: Array,
+                 J: Array) -> None:
         cost = np.zeros(len(b))
         x[b, 0] = x0[b]
         for t in range(K):
             feedback = np.einsum("bij,bj->bi", gain[b, t], x[b, t] - x_bar[b, t])
             u[b, t] = np.clip(u_bar[b, t] + alpha[b, None] * k[b, t] + feedback, lb, ub)
-            x[b, t + 1], c = _rows(self._step, x[b, t], u[b, t], h[b, None])
+            x[b, t + 1], c = _rows(self._step, x[b, t], u[b, t], *self._moment(d, t * h[b]), h[b, None])
             cost += c[:, 0]
-        J[b] = cost + _rows(self._terminal, x[b, K])[0][:, 0]
+        J[b] = cost + _rows(self._terminal, x[b, K], *self._at_end(d))[0][:, 0]
 
-    def _backward(self, b: Rows, K: int, weights: Array, lb: Array, ub: Array, h: Array, x: Array, u: Array,
+    def _at_end(self, d: Array) -> list[Array]:
+        return [d[:, self.timed:]] if self.np else []
+
+    def _backward(self, b: Rows, d: Array, K: int, weights: Array, lb: Array, ub: Array, h: Array, x: Array, u: Array,
                   mu: Array, k: Array, gain: Array, slope: Array, curve: Array, positive: Array, V: Array | None,
-                  V_x: Array | None, V_xx: Array | None) -> None:
+                  V_x: Array | None, V_xx: Array | None, V_p: Array | None = None) -> None:
         n, m = self.shape
-        value, p, P = _rows(self._terminal, x[b, K])
+        value, p, P = _rows(self._terminal, x[b, K], *self._at_end(d))
+        by_p = _rows(self._terminal_by_p, x[b, K], *self._at_end(d))[0] if self.np else np.zeros((len(b), 0))
         value, P = value[:, 0], P.reshape(-1, n, n)
         down, bend, good = np.zeros(len(b)), np.zeros(len(b)), np.ones(len(b), dtype=bool)
         for t in range(K, -1, -1):
@@ -86,7 +104,9 @@ class NumpyKernel:
                     out[b, t] = now
             if t == 0:
                 break
-            cost, F, l, H = _rows(self._slopes, x[b, t - 1], u[b, t - 1], h[b, None], p)  # noqa: E741
+            here = (x[b, t - 1], u[b, t - 1], *self._moment(d, (t - 1) * h[b]), h[b, None], p)
+            cost, F, l, H, *Q_p = _rows(self._slopes, *here)  # noqa: E741
+            by_p = by_p + sum(Q_p)
             F, H = (a.reshape(len(b), n + m, -1).transpose(0, 2, 1) for a in (F, H))  # CasADi stores columns
             Q, q = H + F.transpose(0, 2, 1) @ P @ F, l + np.einsum("bij,bi->bj", F, p)
             Quu, Qux, qu = Q[:, n:, n:], Q[:, n:, :n], q[:, n:]
@@ -103,6 +123,8 @@ class NumpyKernel:
                 + np.einsum("bji,bj->bi", Qux, step)
             P = Q[:, :n, :n] + K_T @ (Quu @ K_t + Qux) + Qux.transpose(0, 2, 1) @ K_t
             P = (P + P.transpose(0, 2, 1)) / 2
+        if V_p is not None:
+            V_p[b] = by_p
         slope[b], curve[b], positive[b] = down, bend, good & np.isfinite(down) & np.isfinite(bend)
 
 

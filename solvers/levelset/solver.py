@@ -98,6 +98,7 @@ class LevelSet:
                  slices: int = 41, cfl: float = 0.75, samples: int = 9, max_memory: float = 4.0,
                  max_seconds: float = 600.0) -> None:
         checks.problem(ocp, "LevelSet")
+        ocp.refuse_parameters("LevelSet")
         owner = f"LevelSet of {ocp.system.name!r}"
         self.ocp, self.grid = ocp, _checked_grid(grid, ocp.system.nx, owner)
         if scheme not in SCHEMES:
@@ -305,6 +306,7 @@ class LevelSetSolution:
 def standard(ocp: OCP) -> LevelSet:
     """Level sets on the problem's box, as the command line makes them; ValueError for more than 3 states."""
     checks.problem(ocp, "level sets")
+    ocp.refuse_parameters("level sets")
     nx = ocp.system.nx
     if nx not in STANDARD:
         raise ValueError(f"level sets of {ocp.system.name!r}: the problem has {nx} states; expected at most "

@@ -6,7 +6,7 @@ import casadi as ca
 import numpy as np
 
 from nocl.data import Controller
-from nocl.judge import answer_of
+from nocl.judge import answer_of, takes_p
 from nocl.ocp import OCP
 from nocl.solvers.lqr import LQR
 from nocl.solvers.nmpc.transcription import Transcription
@@ -18,22 +18,24 @@ Guess = tuple[Array, Array]
 BULGES = 0.1 * 1.4 ** np.arange(12)  # of a line round an obstacle, in lengths of the line
 
 
-def starts(program: Transcription, lqr: LQR | None, x0: Array, t: Array, begin: int, n: int, seed: int) -> list[Guess]:
+def starts(program: Transcription, lqr: LQR | None, x0: Array, t: Array, begin: int, n: int, seed: int,
+           p: Array | None = None) -> list[Guess]:
     """Numbers begin ... begin + n - 1 of: x0 held under u*, an LQR rollout, a straight line to the goal, lines round
     each obstacle that it crosses, on either side, smooth random controls.
 
+    p : the parameters [np], where there are some; lqr is that at them
     The random controls depend on `seed` and their number alone, so that a state gets the same starts in any batch.
     """
-    ocp, N = program.ocp, program.N
-    u_goal = np.tile(ocp.u_goal, (N, 1))
+    ocp, N, row = program.ocp, program.N, np.zeros((1, 0)) if p is None else p[None]
+    u_goal = np.tile(ocp.goals(row)[1], (N, 1))
     found = [(np.tile(x0, (N + 1, 1)), u_goal)]
     if begin + n > 1 and lqr is not None:
-        found += lqr_rollout(program, lqr, x0, t)
-    found.append((x0 + np.linspace(0.0, 1.0, N + 1)[:, None] * -ocp.from_goal(x0), u_goal))
-    found += [(x, u_goal) for x in (sides(ocp, x0, N) if program.n_path else [])]
-    random = (random_controls(ocp, N, 1, np.random.default_rng([seed, number]))[0]
+        found += lqr_rollout(program, lqr, x0, t, p)
+    found.append((x0 + np.linspace(0.0, 1.0, N + 1)[:, None] * -ocp.from_goal(x0, row[0]), u_goal))
+    found += [(x, u_goal) for x in (sides(ocp, x0, N, t, p) if program.n_path else [])]
+    random = (random_controls(ocp, N, 1, np.random.default_rng([seed, number]), row)[0]
               for number in range(max(begin, len(found)), begin + n))
-    return found[begin:begin + n] + [controlled(program, x0, u, t) for u in random]
+    return found[begin:begin + n] + [controlled(program, x0, u, t, p) for u in random]
 
 
 def lqr_of(ocp: OCP) -> LQR | None:
@@ -46,28 +48,28 @@ def lqr_of(ocp: OCP) -> LQR | None:
     return lqr
 
 
-def controlled(program: Transcription, x0: Array, u: Array, t: Array) -> Guess:
+def controlled(program: Transcription, x0: Array, u: Array, t: Array, p: Array | None = None) -> Guess:
     """The rollout of controls u [N, nu] from x0, moved towards u* until it stays near the box X.
 
     A rollout that never does (an unstable system) gives way to x0 held.
     """
-    u_goal = program.ocp.u_goal
+    u_goal = program.ocp.u_goal if p is None else program.ocp.goals(p[None])[1]
     for _ in range(HALVINGS):
-        x = np.vstack([x0, program.rollout(x0, u.T, np.diff(t)[None]).full().T])
+        x = program.rolled(x0, u, t, p)
         if near(program.ocp.system, x):
             return x, u
         u = (u + u_goal) / 2
     return np.tile(x0, (len(u) + 1, 1)), u
 
 
-def lqr_rollout(program: Transcription, lqr: LQR, x0: Array, t: Array) -> list[Guess]:
+def lqr_rollout(program: Transcription, lqr: LQR, x0: Array, t: Array, p: Array | None = None) -> list[Guess]:
     """LQR, clipped to U, from x0 on the nodes t [N+1]; nothing where it runs away."""
     N = program.N
     x, u = np.empty((N + 1, len(x0))), np.empty((N, program.ocp.system.nu))
     x[0] = x0
     for k in range(N):
         u[k] = lqr(x[k], t[k])
-        x[k + 1] = program.step(x[k], u[k], t[k + 1] - t[k])[0].full().ravel()
+        x[k + 1] = program.stepped(x[k], u[k], t, k, p)
         if not near(program.ocp.system, x[:k + 2]):
             return []
     return [(x, u)]
@@ -79,16 +81,19 @@ def from_neighbour(x0: Array, x: Array, u: Array) -> Guess:
     return x + fade * (x0 - x[0]), u
 
 
-def controller_rollout(program: Transcription, controller: Controller, x0: Array, t: Array) -> Guess:
-    """A controller (x, t) -> u from x0, sampled at the nodes, held and clipped to U; where it fails, x stays."""
-    s, N = program.ocp.system, program.N
-    x, u = np.tile(x0, (N + 1, 1)), np.tile(program.ocp.u_goal, (N, 1))
+def controller_rollout(program: Transcription, controller: Controller, x0: Array, t: Array,
+                       p: Array | None = None) -> Guess:
+    """A controller (x, t[, p]) -> u from x0, sampled at the nodes, held and clipped to U; where it fails, x stays."""
+    s, N, ocp = program.ocp.system, program.N, program.ocp
+    x, u = np.tile(x0, (N + 1, 1)), np.tile(ocp.u_goal if p is None else ocp.goals(p[None])[1], (N, 1))
+    more = [p] if takes_p(ocp, controller) else []
     for k in range(N):
-        answer = checks.numeric(answer_of(controller, x[k], float(t[k])), "the guess's answer", "NMPC", f"u [{s.nu}]")
+        answer = checks.numeric(answer_of(controller, x[k], float(t[k]), *more), "the guess's answer", "NMPC",
+                                f"u [{s.nu}]")
         if answer.size != s.nu:
             raise ValueError(f"NMPC: the guess's answer has shape {answer.shape}; expected u [{s.nu}]")
         control = np.clip(answer.reshape(s.nu), s.lbu, s.ubu)
-        end = program.step(x[k], control, t[k + 1] - t[k])[0].full().ravel()
+        end = program.stepped(x[k], control, t, k, p)
         if not (np.isfinite(control).all() and np.isfinite(end).all()):
             x[k + 1:] = x[k]
             break
@@ -96,21 +101,26 @@ def controller_rollout(program: Transcription, controller: Controller, x0: Array
     return x, u
 
 
-def sides(ocp: OCP, x0: Array, N: int) -> list[Array]:
-    """Lines from x0 to the goal [N+1, nx], bent round each obstacle that the straight one crosses, on either side."""
-    s, found = np.linspace(0.0, 1.0, N + 1)[:, None], list[Array]()
-    line = x0 - s * ocp.from_goal(x0)
+def sides(ocp: OCP, x0: Array, N: int, t: Array | None = None, p: Array | None = None) -> list[Array]:
+    """Lines from x0 to the goal [N+1, nx], bent round each obstacle that the straight one crosses, on either side.
+
+    The times t [N+1] of the nodes and parameters p [np], where the problem has them.
+    """
+    s, found, node = np.linspace(0.0, 1.0, N + 1)[:, None], list[Array](), ocp.functions.node
+    off = ocp.from_goal(x0, p)
+    line, times = x0 - s * off, np.zeros(N + 1) if t is None else t
     for i in range(len(ocp.path_constraints)):
-        values = ocp.h(line.T).full()[i]
+        values = ocp.h(*node.columns(x=line, t=times, p=p)).full()[i]
         k = int(np.argmin(values))
         if values[k] >= 0:
             continue
-        across = _across(ocp.functions.h_derivatives(line[k], 0)[1], i, -ocp.from_goal(x0))
+        slopes = ocp.functions.h_derivatives(*node.columns(x=line[k], t=times[k], p=p), 0)[1]
+        across = _across(slopes, i, -off)
         if across is None:
             continue
         for side in (across, -across):
             bent = (line + bulge * np.sin(np.pi * s) * side for bulge in BULGES)
-            found += [x for x in bent if ocp.h(x.T).full()[i].min() >= 0][:1]
+            found += [x for x in bent if ocp.h(*node.columns(x=x, t=times, p=p)).full()[i].min() >= 0][:1]
     return found
 
 

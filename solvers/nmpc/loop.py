@@ -27,12 +27,12 @@ class Planner(Protocol):
     @property
     def window(self) -> float: ...
 
-    def solve(self, x0: ArrayLike, guess: Any = None, *, nodes: ArrayLike | None = None, workers: int | str = "auto",
-              progress: bool | None = None) -> Solution: ...
+    def solve(self, x0: ArrayLike, guess: Any = None, *, p: Any = None, nodes: ArrayLike | None = None,
+              workers: int | str = "auto", progress: bool | None = None) -> Solution: ...
 
 
 class Loop:
-    """u(x, t) by solving again from the measured x, warm-started from the last plan.
+    """u(x, t[, p]) by solving again from the measured x, warm-started from the last plan.
 
     Shrinking (default): the plan reaches from t to the OCP's horizon T, or to t + `horizon` where NMPC has a shorter
     one, at most to T. Receding: it is as long at each t as at t = 0, and charges G, or the terminal cost, at its own
@@ -49,10 +49,14 @@ class Loop:
         if hold is not None:
             checks.whole(hold, "hold, how many controls the horizon has,", "NMPC.controller", 1)
         receding = checks.flag(receding, "receding", "NMPC.controller")
+        if receding and nmpc.ocp.uses_time:
+            raise ValueError("a receding window begins at t = 0 anew at each call, but the problem holds the time t; "
+                             "expected one without, or receding=False")
         self.nmpc, self.hold, self.receding = nmpc, hold or nmpc.intervals, receding
         self.plan: Solution | None = None
         self.begin = 0.0  # the time of the plan's first node
         self.asked: Array | None = None  # the states of the last call
+        self.p = np.zeros((0, nmpc.ocp.np))  # ... and their parameters [B, np]
         self.stats: list[dict[str, Any]] = []
 
     @property
@@ -60,10 +64,15 @@ class Loop:
         """Solves that failed, over all calls and states."""
         return sum(int((~step["success"]).sum()) for step in self.stats)
 
-    def __call__(self, x: ArrayLike, t: float = 0.0) -> Array:
-        """u [nu] or [B, nu] at time t."""
+    @property
+    def ocp(self) -> OCP:
+        return self.nmpc.ocp
+
+    def __call__(self, x: ArrayLike, t: float = 0.0, p: Any = None) -> Array:
+        """u [nu] or [B, nu] at time t; p as NMPC.solve takes it, where the problem has parameters."""
         s = self.nmpc.ocp.system
         rows, single = checks.states(x, s.nx, s.name, "x")
+        self.p = self.nmpc.ocp.parameters_of(p, len(rows), "NMPC as feedback")
         nodes = self.nodes(float(t))
         if self._afresh(rows, float(t)):
             self.stats, self.plan = [], None
@@ -89,17 +98,19 @@ class Loop:
         """The last plan, shifted; else x held under u*."""
         if self.plan is None:
             return (np.repeat(x[:, None], len(nodes), axis=1),
-                    np.tile(self.nmpc.ocp.u_goal, (len(x), len(nodes) - 1, 1)))
+                    np.repeat(self.nmpc.ocp.goals(self.p)[1][:, None], len(nodes) - 1, axis=1))
         return shifted(self.plan, x, nodes + (t - self.begin if self.receding else 0.0))
 
     def _solve(self, x: Array, guess: tuple[Array, Array], nodes: Array, t: float) -> Solution:
         """The new plan: a row whose solve fails twice holds the guess instead."""
         warm = self.plan is not None
         plan = Trajectory(nodes, *guess) if warm else None
-        solution = self.nmpc.solve(x, plan, nodes=nodes, workers=1, progress=False)
+        has = bool(self.nmpc.ocp.np)
+        solution = self.nmpc.solve(x, plan, p=self.p if has else None, nodes=nodes, workers=1, progress=False)
         failed = np.flatnonzero(~np.asarray(solution.success, dtype=bool))
         if warm and failed.size:
-            again = self.nmpc.solve(x[failed], nodes=nodes, workers=1, progress=False)
+            again = self.nmpc.solve(x[failed], p=self.p[failed] if has else None, nodes=nodes, workers=1,
+                                    progress=False)
             solution.put(failed, replace(again, seconds=again.seconds + solution.seconds[failed],
                                          iterations=again.iterations + solution.iterations[failed]))
         success = np.asarray(solution.success)

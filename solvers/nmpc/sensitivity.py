@@ -31,7 +31,7 @@ class Derivatives:
 
     @cached_property
     def flow(self) -> ca.Function:
-        """(x, u, costate) -> d/dt of (x, costate), the control held: f and -dH/dx."""
+        """(x, u[, t][, p], costate) -> d/dt of (x, costate), the control held: f and -dH/dx."""
         p, at = self.program, self.program.functions.stage
         costate = at.sym("costate", p.ocp.system.nx)
         H_x = ca.gradient(at.hamiltonian(costate, soft=p.soft), at.x)
@@ -39,12 +39,12 @@ class Derivatives:
 
     @cached_property
     def first(self) -> ca.Function:
-        """(x, u, h, costate at the end) -> gradient of Q in (x, u), side by side."""
+        """(x, u[, t][, p], h, costate at the end) -> gradient of Q in (x, u), side by side."""
         return self._stage(second=False)
 
     @cached_property
     def second(self) -> ca.Function:
-        """(x, u, h, costate at the end) -> (gradient of Q, Jacobian of F, Hessian of Q) in (x, u)."""
+        """(x, u[, t][, p], h, costate at the end) -> (gradient of Q, Jacobian of F, Hessian of Q) in (x, u)."""
         return self._stage(second=True)
 
     def _stage(self, second: bool) -> ca.Function:
@@ -57,7 +57,7 @@ class Derivatives:
 
     @cached_property
     def end(self) -> ca.Function:
-        """(x, t) -> (gradient, Hessian) of the cost at the last node."""
+        """(x, t[, p]) -> (gradient, Hessian) of the cost at the last node."""
         at = self.program.functions.feedback(ca.MX)
         hessian, gradient = ca.hessian(self.program.end_cost(*at.inputs), at["x"])
         return at.function("end", {"V_x": ca.densify(gradient), "V_xx": ca.densify(hessian)})
@@ -69,34 +69,38 @@ def derivatives(program: Transcription) -> Derivatives:
     return Derivatives(program)
 
 
-def cost_to_go(program: Transcription, t: Array, x: Array, u: Array) -> Array:
-    """V [N+1] at the nodes t of x [N+1, nx], u [N, nu]."""
-    stages = program.step(x[:-1].T, u.T, np.diff(t)[None])[1].full().ravel()
-    return np.cumsum(np.r_[float(program.end_cost(x[-1], t[-1])), stages[::-1]])[::-1]
+def cost_to_go(program: Transcription, t: Array, x: Array, u: Array, p: Array | None = None) -> Array:
+    """V [N+1] at the nodes t of x [N+1, nx], u [N, nu]; p [np], here and below, where there are parameters."""
+    stages = program.step(x[:-1].T, u.T, *program.moment(t[:-1], p), np.diff(t)[None])[1].full().ravel()
+    return np.cumsum(np.r_[float(program.end_cost(x[-1], t[-1], p)), stages[::-1]])[::-1]
 
 
-def dense(program: Transcription, t: Array, x: Array, u: Array, costate: Array) -> Array:
+def dense(program: Transcription, t: Array, x: Array, u: Array, costate: Array, p: Array | None = None) -> Array:
     """(x, costate) at both ends of each interval and their time derivatives [N, 4, 2 nx]: start, end, slopes."""
-    d, h = derivatives(program), np.diff(t)[None]
-    after = d.first(x[:-1].T, u.T, h, costate[1:].T).full()[: x.shape[1]].T  # an active path constraint is a jump
+    d, h, nx = derivatives(program), np.diff(t)[None], x.shape[1]
+    moments = [program.moment(times, p) for times in (t[:-1], t[1:])]
+    after = d.first(x[:-1].T, u.T, *moments[0], h, costate[1:].T).full()[:nx].T  # an active path constraint is a jump
     start, end = np.c_[x[:-1], after], np.c_[x[1:], costate[1:]]
-    slopes = (d.flow(e[:, : x.shape[1]].T, u.T, e[:, x.shape[1]:].T).full().T for e in (start, end))
+    slopes = (d.flow(e[:, :nx].T, u.T, *moment, e[:, nx:].T).full().T
+              for e, moment in zip((start, end), moments, strict=True))
     return np.stack([start, end, *slopes], axis=1)
 
 
-def second_variation(program: Transcription, t: Array, x: Array, u: Array, costate: Array) -> tuple[Array, Array]:
+def second_variation(program: Transcription, t: Array, x: Array, u: Array, costate: Array,
+                     p: Array | None = None) -> tuple[Array, Array]:
     """(gain [N, nu, nx], V_xx [N+1, nx, nx]); NaN from where the solution is no strict local optimum."""
     d, n = derivatives(program), x.shape[1]
     N, m = u.shape
     gradient, F_z, W = (np.moveaxis(v.full().reshape(v.shape[0], N, -1), 1, 0) for v in d.second(
-        x[:-1].T, u.T, np.diff(t)[None], costate[1:].T))
-    end_gradient, P = (v.full() for v in d.end(x[-1], t[-1]))
+        x[:-1].T, u.T, *program.moment(t[:-1], p), np.diff(t)[None], costate[1:].T))
+    own = [] if p is None or not p.size else [p]
+    end_gradient, P = (v.full() for v in d.end(x[-1], t[-1], *own))
     after = np.vstack([gradient[:, :n, 0], end_gradient.T])  # gradient at a node without its own path constraints
     free = _free(program, u, gradient[:, n:, 0])
     gain, V_xx = np.full((N, m, n), np.nan), np.full((N + 1, n, n), np.nan)
     V_xx[N], H = P, np.zeros((0, n))
     for k in range(N - 1, -1, -1):
-        P, H = _with_path(program, x[k + 1], after[k + 1] - costate[k + 1], P, H)
+        P, H = _with_path(program, x[k + 1], program.moment(t[k + 1], p), after[k + 1] - costate[k + 1], P, H)
         step = _riccati(F_z[k], W[k], P, H, free[k])
         if step is None:
             break
@@ -113,16 +117,17 @@ def _free(program: Transcription, u: Array, gradient: Array) -> NDArray[np.bool_
     return ~((gradient * width > lower) & (lower < 0.5) | (-gradient * width > upper) & (upper < 0.5))
 
 
-def _with_path(program: Transcription, x: Array, jump: Array, P: Array, H: Array) -> tuple[Array, Array]:
+def _with_path(program: Transcription, x: Array, moment: list[Array], jump: Array, P: Array,
+               H: Array) -> tuple[Array, Array]:
     """P and the equations H dx = 0 with a node's own path constraints; the costate jumps by mu' dh/dx across it."""
     if not program.n_path:
         return P, H
     path = program.functions.h_derivatives
-    h, h_x = (v.full() for v in path(x, 0)[:2])
+    h, h_x = (v.full() for v in path(x, *moment, 0)[:2])
     mu = np.linalg.lstsq(h_x.T, jump, rcond=None)[0]
     active = mu > np.maximum(h[:, 0], 0.0) + np.sqrt(ROUNDING)
     mu = np.where(active, mu, 0.0)
-    return P - path(x, mu)[2].full(), np.vstack([H, h_x[active]])
+    return P - path(x, *moment, mu)[2].full(), np.vstack([H, h_x[active]])
 
 
 def _riccati(F_z: Array, W: Array, P: Array, H: Array, free: NDArray[np.bool_]) -> tuple[Array, Array, Array] | None:

@@ -46,13 +46,13 @@ class NMPC:
     ----------
     ocp : OCP
     intervals : N
-    dynamics : casadi.Function (x, u) -> xdot, or an object with `to_casadi()`; default: the exact f
+    dynamics : casadi.Function (x, u[, t][, p]) -> xdot, or an object with `to_casadi()`; default: the exact f
     solver : "fatrop" (fast) or "ipopt" (reference); another nlpsol of CasADi's by its name
     substeps : RK4 steps in each interval; default: 1, or where the first solutions show that this is too coarse for the
         plant, as many as they ask for (nocl/substeps.py); a warning says so
     horizon : length of the window that is optimised, at most the OCP's horizon T (default); it ends at T at the latest
-    terminal : cost at the window's end in place of G: a casadi.Function (x) or (x, t) -> number, or an object with
-        `value_to_casadi()`, such as a trained value function
+    terminal : cost at the window's end in place of G: a casadi.Function (x), (x, t) or (x, t, p) -> number, or an
+        object with `value_to_casadi()`, such as a trained value function
     starts : guesses tried for each state, beyond those that `solve` is given
     passes : rounds in which states of one batch are solved again from other states' solutions, until a round improves
         nothing; nocl.solvers.search says what a round tries
@@ -64,6 +64,8 @@ class NMPC:
     options : of the nlpsol, like {"ipopt.tol": 1e-6}
     compiled : compile the program by the C compiler, once: into the folder that is named here, or for True into that
         of the environment's NOCL_CACHE (without it: for as long as the process lives); later constructions load it
+
+    Parameters of the problem are parameters of the program: other values need no other one.
 
     A second NMPC of an equal problem with equal settings uses the program that the first one built.
     """
@@ -157,15 +159,17 @@ class NMPC:
         """Mirror images of the problem, as signs of x - x* and u - u*."""
         return mirrors(self.ocp, self.dynamics)
 
-    def solve(self, x0: ArrayLike, guesses: Any = None, *, t0: float = 0.0, nodes: ArrayLike | None = None,
-              starts: int | None = None, gains: bool = False, workers: int | str = "auto",
-              out: str | os.PathLike[str] | None = None, progress: bool | None = None) -> Solution:
+    def solve(self, x0: ArrayLike, guesses: Any = None, *, p: Any = None, t0: float = 0.0,
+              nodes: ArrayLike | None = None, starts: int | None = None, gains: bool = False,
+              workers: int | str = "auto", out: str | os.PathLike[str] | None = None,
+              progress: bool | None = None) -> Solution:
         """The best solution found from each state x0 [nx] or [B, nx] at time t0.
 
         Parameters
         ----------
+        p : parameters, where the problem has them: [np] for all, [B, np], or by name (OCP.parameters_of)
         guesses : tried first: a Solution or Trajectory nearby (solved with a small barrier: a warm start), controls u
-            [B, N, nu], (x [B, N+1, nx], u), a controller (x, t) -> u whose rollout is meant, or a list of them
+            [B, N, nu], (x [B, N+1, nx], u), a controller (x, t[, p]) -> u whose rollout is meant, or a list of them
         nodes : times of the nodes [N+1]; default: N equal intervals from t0 to the window's end
         starts : built-in starts for each state; default: self.starts, or none where guesses are given
         gains : also the Solution's `gain` and `V_xx`
@@ -184,16 +188,16 @@ class NMPC:
         rows, _ = checks.states(x0, s.nx, s.name)
         if not len(rows):
             raise ValueError(f"x0 has shape {np.shape(x0)}; expected at least one state")
-        t = self._nodes(t0, nodes)
+        t, values = self._nodes(t0, nodes), self.ocp.parameters_of(p, len(rows), "NMPC")
         tried = [one for one in (guesses if isinstance(guesses, list) else [guesses]) if one is not None]
         tried.sort(key=lambda one: not _is_solution(one))
-        given, warm = [_given(one, self, rows, t) for one in tried], sum(map(_is_solution, tried))
+        given, warm = [_given(one, self, rows, t, values) for one in tried], sum(map(_is_solution, tried))
         n = checks.whole(starts, "starts", "NMPC.solve") if starts is not None else (0 if given else self.starts)
         gains = checks.flag(gains, "gains", "NMPC.solve")
         if n < 1 and not given:
             raise ValueError(f"starts is {n}; expected at least 1, or guesses")
         show = sys.stderr.isatty() if progress is None else progress
-        call = _Call(rows, t, given, warm, n, Pool(workers), None if out is None else Path(out), show)
+        call = _Call(rows, t, values, given, warm, n, Pool(workers), None if out is None else Path(out), show)
         solution = self._settle(call) if self.substeps is None else self._told(self._search(call))
         return self.with_gains(solution) if gains else solution
 
@@ -229,11 +233,11 @@ class NMPC:
 
     def _search(self, call: _Call) -> Solution:
         """Solved with this number of substeps."""
-        key = self._run_key(call.x0, call.t, call.given, call.starts, call.warm) if call.out else ""
+        key = self._run_key(call.x0, call.t, call.p, call.given, call.starts, call.warm) if call.out else ""
         states = _States(self, call, Journal(call.out, key))
         rounds = self.passes if call.starts else 0
         search = Search(states, self.ocp, self.mirrors if rounds else [], call.x0, call.t, neighbours=self.neighbours,
-                        rounds=rounds, seed=self.seed)
+                        rounds=rounds, seed=self.seed, p=call.p)
         search.stage("NMPC", search.cold, np.arange(len(call.x0)), 0, call.starts)
         search.improve(call.starts)
         return states.finished(search.solution())
@@ -250,11 +254,11 @@ class NMPC:
         gain, V_xx = np.full((B, N, nu, nx), np.nan), np.full((B, N + 1, nx, nx), np.nan)
         for i in np.flatnonzero(solution.success):
             gain[i], V_xx[i] = second_variation(self.program, solution.t[i], solution.x[i], solution.u[i],
-                                                solution.V_x[i])
+                                                solution.V_x[i], None if solution.p is None else solution.p[i])
         return replace(solution, gain=gain, V_xx=V_xx)
 
     def controller(self, hold: int | None = None, receding: bool = False) -> Loop:
-        """Closed loop u(x, t), solved again at each call from the shifted last plan.
+        """Closed loop u(x, t[, p]), solved again at each call from the shifted last plan.
 
         hold: how many controls T has (default N); receding: a window that moves on, instead of one that ends at T.
         """
@@ -271,9 +275,9 @@ class NMPC:
             raise ValueError(f"nodes end at {t[-1]:g}; expected {T:g}, the horizon: give NMPC a shorter `horizon`")
         return t
 
-    def _run_key(self, x0: Array, t: Array, given: list[list[Guess]], *counts: int) -> str:
+    def _run_key(self, x0: Array, t: Array, p: Array, given: list[list[Guess]], *counts: int) -> str:
         """A fingerprint of all that outcomes depend on."""
-        arrays = [part for guess in given for row in guess for part in row]
+        arrays = [*([p] if p.size else []), *(part for guess in given for row in guess for part in row)]
         return fingerprint(self.key, x0, t, *arrays, counts, self.passes, self.neighbours, self.seed, self.time_limit,
                            version("casadi"), version("nocl"))
 
@@ -308,12 +312,13 @@ def shared_program(recipe: _Recipe) -> Transcription:
 
 
 @lru_cache(maxsize=KEPT)
-def _lqr(ocp: OCP) -> LQR | None:
-    return starting.lqr_of(ocp)
+def _lqr(ocp: OCP, p: tuple[float, ...]) -> LQR | None:
+    """LQR about the goal at parameters p, or None where there is none."""
+    return starting.lqr_of(ocp.folded(np.array(p)))
 
 
 def _terminal(ocp: OCP, terminal: Any) -> ca.Function | None:
-    """The terminal cost as a casadi.Function (x) or (x, t) -> number."""
+    """The terminal cost as a casadi.Function (x), (x, t) or (x, t, p) -> number."""
     if terminal is None:
         return None
     check_made_for(ocp, terminal, "NMPC: the terminal cost")
@@ -321,10 +326,11 @@ def _terminal(ocp: OCP, terminal: Any) -> ca.Function | None:
     if not isinstance(g, ca.Function):
         raise ValueError(f"NMPC: terminal is a {type(terminal).__name__}; expected a casadi.Function (x) or (x, t) -> "
                          "cost, or an object with value_to_casadi()")
-    sizes = [g.numel_in(i) for i in range(g.n_in())]
-    if sizes not in ([ocp.system.nx], [ocp.system.nx, 1]) or g.numel_out(0) != 1:
+    sizes, every = [g.numel_in(i) for i in range(g.n_in())], [v.numel() for v in ocp.functions.feedback().inputs]
+    if not sizes or sizes != every[:len(sizes)] or g.numel_out(0) != 1:
         raise ValueError(f"NMPC: terminal {g.name()} takes vectors of length {sizes} and returns {g.numel_out(0)}; "
-                         f"expected (x [{ocp.system.nx}]) or (x, t) -> one number")
+                         f"expected (x [{ocp.system.nx}]) or (x, t) -> one number"
+                         + (f", or one of (x, t, p [{ocp.np}])" if ocp.np else ""))
     return g
 
 
@@ -334,6 +340,7 @@ class _Call:
 
     x0: Array  # [B, nx]
     t: Array  # [N+1]
+    p: Array  # [B, np]
     given: list[list[Guess]]
     warm: int  # how many of these, the first ones, are solutions
     starts: int
@@ -358,8 +365,9 @@ class _Job:
     def __call__(self, task: Task) -> Outcome:
         program, guesses = self.nmpc.program, list(task.guesses)
         if task.starts:
-            guesses += starting.starts(program, _lqr(self.nmpc.ocp), task.x0, task.t, task.begin, task.starts,
-                                       task.seed)
+            p = () if task.p is None else tuple(task.p.tolist())
+            guesses += starting.starts(program, _lqr(self.nmpc.ocp, p), task.x0, task.t, task.begin, task.starts,
+                                       task.seed, task.p)
         return attempt(program, task, guesses)
 
 
@@ -367,8 +375,9 @@ class _States:
     """The states of one call of solve, as a search asks for them: a task for each state and stage."""
 
     def __init__(self, nmpc: NMPC, call: _Call, journal: Journal) -> None:
-        self.nmpc, self.call, self.journal, self.x0, self.t = nmpc, call, journal, call.x0, call.t
-        self.refusal = [violated_start(nmpc.program, x) for x in self.x0]
+        self.nmpc, self.call, self.journal = nmpc, call, journal
+        self.x0, self.t, self.p = call.x0, call.t, call.p
+        self.refusal = [violated_start(nmpc.program, x, self.t[0], p) for x, p in zip(self.x0, self.p, strict=True)]
         self.failed: list[Answer | None] = [None] * len(self.x0)  # of each state's solves that failed, by rank
 
     def begin(self, stage: int, what: str) -> None:
@@ -379,8 +388,12 @@ class _States:
         name, begun = (f"fresh-{self.number}", True) if self.number else ("start", False)
         given, warm = ([], 0) if begun else (self.call.given, self.call.warm)
         tasks = [Task(f"{name}-{i:06d}", i, self.x0[i], self.t, [guess[i] for guess in given], warm, first, count,
-                      self.nmpc.seed, self.nmpc.time_limit) for i in rows]
+                      self.nmpc.seed, self.nmpc.time_limit, p=self._own(i)) for i in rows]
         return self._do(tasks)
+
+    def _own(self, i: int) -> Array | None:
+        """The parameters of a state."""
+        return self.p[i] if self.nmpc.ocp.np else None
 
     def follow(self, moves: Moves, guess: Callable[[Moves], dict[str, Array]]) -> Found:
         tasks = []
@@ -388,7 +401,7 @@ class _States:
             made = guess(moves[moves.row == i])
             guesses = [starting.from_neighbour(self.x0[i], x, u) for x, u in zip(made["x"], made["u"], strict=True)]
             tasks.append(Task(f"round-{self.number}-{i:06d}", int(i), self.x0[i], self.t, guesses,
-                              time_limit=self.nmpc.time_limit))
+                              time_limit=self.nmpc.time_limit, p=self._own(i)))
         return self._do(tasks)
 
     def _do(self, tasks: Sequence[Task]) -> Found:
@@ -398,7 +411,8 @@ class _States:
             best, failed = self.failed[outcome.row], outcome.failed
             if failed is not None and (best is None or failed.rank < best.rank):
                 self.failed[outcome.row] = failed
-        yield np.array([o.row for o in outcomes], dtype=np.int64), solved_by(self.nmpc.ocp, self.t, outcomes)
+        yield np.array([o.row for o in outcomes], dtype=np.int64), \
+            solved_by(self.nmpc.ocp, self.t, outcomes, self.p)
 
     def finished(self, found: Solution) -> Solution:
         """What the search found, with V, what solution(t) interpolates, and messages."""
@@ -407,9 +421,10 @@ class _States:
         for i in range(len(self.x0)):
             row = (self.t, found.x[i], found.u[i])
             if found.success[i]:
-                found.V[i], between[i] = cost_to_go(p, *row), dense(p, *row, found.V_x[i])
+                own = self._own(i)
+                found.V[i], between[i] = cost_to_go(p, *row, own), dense(p, *row, found.V_x[i], own)
             elif not self.refusal[i]:
-                message[i] = failure(p, self.x0[i], int(found.starts[i]), self.failed[i])
+                message[i] = failure(p, self.x0[i], int(found.starts[i]), self.failed[i], self._own(i))
         return replace(found, message=np.array(message), dense=between)
 
 
@@ -417,24 +432,25 @@ def _is_solution(guess: Any) -> bool:
     return isinstance(guess, (Solution, Trajectory))
 
 
-def _given(guess: Any, nmpc: NMPC, x0: Array, t: Array) -> list[Guess]:
+def _given(guess: Any, nmpc: NMPC, x0: Array, t: Array, p: Array) -> list[Guess]:
     """A user's guess, checked: states and controls for each x0."""
     s, N, B = nmpc.ocp.system, nmpc.intervals, len(x0)
     check_made_for(nmpc.ocp, guess, "NMPC: the guess")
     if isinstance(guess, tuple) and len(guess) != 2:
         raise ValueError(f"NMPC: the guess is a tuple of {len(guess)}; expected (x [B, N+1, nx], u [B, N, nu])")
     if callable(guess) and not isinstance(guess, Solution):
-        return [starting.controller_rollout(nmpc.program, guess, row, t) for row in x0]
+        return [starting.controller_rollout(nmpc.program, guess, row, t, own)
+                for row, own in zip(x0, p, strict=True)]
     x, u = (guess.x, guess.u) if hasattr(guess, "x") and hasattr(guess, "u") else \
         guess if isinstance(guess, tuple) else (None, guess)
     u = _shaped(u, (B, N, s.nu), "the guess's u", "[B, N, nu]")
     if x is not None:
         return list(zip(_shaped(x, (B, N + 1, s.nx), "the guess's x", "[B, N+1, nx]"), u, strict=True))
-    return [_rollout(nmpc.program, row, v, t) for row, v in zip(x0, u, strict=True)]
+    return [_rollout(nmpc.program, row, v, t, own) for row, v, own in zip(x0, u, p, strict=True)]
 
 
-def _rollout(program: Transcription, x0: Array, u: Array, t: Array) -> Guess:
-    rolled = np.vstack([x0, program.rollout(x0, u.T, np.diff(t)[None]).full().T])
+def _rollout(program: Transcription, x0: Array, u: Array, t: Array, p: Array) -> Guess:
+    rolled = program.rolled(x0, u, t, p)
     return (rolled if np.isfinite(rolled).all() else np.tile(x0, (len(u) + 1, 1))), u
 
 

@@ -30,6 +30,7 @@ class Task:
     starts: int = 0
     seed: int = 0
     time_limit: float | None = None  # seconds of each solve
+    p: Array | None = None  # [np], where there are parameters
     size: int = 1  # states
 
     def outcome(self, arrays: dict[str, Any]) -> Outcome:
@@ -56,7 +57,8 @@ class Outcome:
         found: dict[str, Any] = {"costs": self.costs, "seconds": self.seconds, "iterations": self.iterations}
         for kind in ("best", "failed"):
             answer = getattr(self, kind)
-            found |= {} if answer is None else {f"{kind}.{name}": value for name, value in vars(answer).items()}
+            found |= {} if answer is None else {
+                f"{kind}.{name}": value for name, value in vars(answer).items() if value is not None}
         return found
 
 
@@ -70,8 +72,9 @@ def attempt(program: Transcription, task: Task, guesses: Sequence[Guess]) -> Out
     """Solve from each guess."""
     begin, answers, at = time.perf_counter(), list[Answer](), (task.x0, task.t)
     for i, (x, u) in enumerate(guesses):
-        warm = program.warm.solve(*at, x, u, task.time_limit) if i < task.warm else None
-        answers.append(warm if warm is not None and warm.success else program.solve(*at, x, u, task.time_limit))
+        one = (*at, x, u, task.time_limit, task.p)
+        warm = program.warm.solve(*one) if i < task.warm else None
+        answers.append(warm if warm is not None and warm.success else program.solve(*one))
     answers += _second_opinion(program, task, answers)
     seconds = time.perf_counter() - begin
     good, bad = ([a for a in answers if bool(a.success) is ok] for ok in (True, False))
@@ -98,28 +101,31 @@ def _second_opinion(program: Transcription, task: Task, answers: Sequence[Answer
 
 
 def _by_ipopt(program: Transcription, task: Task, start: Answer) -> Answer:
-    answer = program.second.solve(task.x0, task.t, start.x, start.u, task.time_limit)
+    answer = program.second.solve(task.x0, task.t, start.x, start.u, task.time_limit, task.p)
     return replace(answer, message=f"{answer.message}, by IPOPT after fatrop: {start.message}")
 
 
-def solved_by(ocp: OCP, t: Array, outcomes: Sequence[Outcome]) -> Solution:
-    """What tasks on the nodes t [N+1] found, a row each; NaN where a task found nothing."""
-    found = Solution.blank(np.tile(t, (len(outcomes), 1)), ocp.system.nx, ocp.system.nu)
+def solved_by(ocp: OCP, t: Array, outcomes: Sequence[Outcome], p: Array | None = None) -> Solution:
+    """What tasks on the nodes t [N+1] found, a row each; NaN where a task found nothing. p [B, np] of all states."""
+    own = None if p is None else p[[o.row for o in outcomes]]
+    found = Solution.blank(np.tile(t, (len(outcomes), 1)), ocp.system.nx, ocp.system.nu, own)
     tried = np.full((len(outcomes), max((len(o.costs) for o in outcomes), default=0)), np.nan)
     for i, outcome in enumerate(outcomes):
         tried[i, :len(outcome.costs)] = outcome.costs
         if outcome.best is not None:
             found.x[i], found.u[i], found.V_x[i] = outcome.best.x, outcome.best.u, outcome.best.costate
             found.cost[i], found.success[i] = outcome.best.cost, True
+            if found.V_p is not None and outcome.best.V_p is not None:
+                found.V_p[i] = outcome.best.V_p
     return replace(found, tried=tried, message=np.array([o.best.message if o.best else "" for o in outcomes], np.str_),
                    seconds=np.array([o.seconds for o in outcomes]),
                    iterations=np.array([o.iterations for o in outcomes], dtype=np.int64))
 
 
-def failure(program: Transcription, x0: Array, starts: int, failed: Answer | None) -> str:
+def failure(program: Transcription, x0: Array, starts: int, failed: Answer | None, p: Array | None = None) -> str:
     """Why none of the starts converged, by the most feasible of them."""
     reason, outcome = ("nothing was tried", "") if failed is None else (failed.message, failed.outcome)
-    return (f"no start of {starts} converged from x0 = {_text(x0)}{outside(program, x0)}: {reason}; "
+    return (f"no start of {starts} converged from x0 = {_text(x0)}{_at(program, p)}{outside(program, x0)}: {reason}; "
             f"try {_remedy(outcome, program)}")
 
 
@@ -140,16 +146,16 @@ def _remedy(outcome: str, program: Transcription) -> str:
     return "more starts, another guess, or more intervals" + soft
 
 
-def violated_start(program: Transcription, x0: Array) -> str:
-    """Why x0 is no start at all: inside an obstacle that no control can undo."""
+def violated_start(program: Transcription, x0: Array, t: float = 0.0, p: Array | None = None) -> str:
+    """Why x0 at time t is no start at all: inside an obstacle that no control can undo."""
     if not program.n_path:
         return ""
-    h = program.ocp.h(x0).full().ravel()
+    h = program.ocp.h(x0, *program.moment(t, p)).full().ravel()
     i = int(np.argmin(h))
     if h[i] >= -FEASIBLE:
         return ""
     return (f"infeasible: path constraint {list(program.ocp.path_constraints)[i]!r} is violated by {-h[i]:.3g} at node "
-            f"0, by x0 = {_text(x0)} itself: move x0, or use constraints='soft'")
+            f"0, by x0 = {_text(x0)}{_at(program, p)} itself: move x0, or use constraints='soft'")
 
 
 def outside(program: Transcription, x0: Array) -> str:
@@ -158,6 +164,13 @@ def outside(program: Transcription, x0: Array) -> str:
     out = [f"{name} = {v:.4g} outside [{low:g}, {high:g}]" for name, v, low, high in
            zip(s.state_names, x0, s.lbx, s.ubx, strict=True) if not low <= v <= high]
     return f" (x0 is outside X: {', '.join(out)})" if out else ""
+
+
+def _at(program: Transcription, p: Array | None) -> str:
+    """The parameters in words, "" where there are none."""
+    if p is None or not len(p):
+        return ""
+    return f" at {', '.join(f'{n} = {v:.4g}' for n, v in zip(program.ocp.parameter_names, p, strict=True))}"
 
 
 def _text(x: Array) -> str:

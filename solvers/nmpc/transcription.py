@@ -1,7 +1,7 @@
 """Multiple shooting: an OCP as a nonlinear program with the structure that fatrop needs, and back.
 
 Variables w = [x_0, u_0, x_1, u_1, ..., x_N], parameters p = [x_0, h_0, ..., h_{N-1}, t_N], the lengths of the
-intervals and the time of the last node.
+intervals and the time of the last node, then the parameters of the problem.
 Constraints, stage by stage: x_{k+1} - F(x_k, u_k; h_k) = 0, then x_0 - p = 0 at k = 0 and h(x_k) >= 0 at k >= 1. A
 gap's multiplier is minus the costate of the node that it leads to: lambda_{k+1} = dJ*/dx_{k+1}.
 """
@@ -24,6 +24,7 @@ from nocl.scales import steps, units
 from nocl.support import compiler
 from nocl.support.checks import Array
 from nocl.support.guard import Guarded, NoAnswerError
+from nocl.translate.arguments import Arguments
 
 BACKENDS: dict[str, dict[str, Any]] = {
     "ipopt": {"ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-9, "ipopt.max_iter": 500},
@@ -63,6 +64,7 @@ class Answer:
     violation: float  # the largest, of any constraint, scaled
     iterations: int
     outcome: str  # how it ended: a key of OUTCOMES, GIVEN_UP, or CasADi's own name
+    V_p: Array | None = None  # [np], dJ*/dp, where there are parameters
 
     @property
     def rank(self) -> tuple[bool, float]:
@@ -90,13 +92,13 @@ class Transcription:
     """The program of an OCP under dynamics f on N intervals; built when first used, so that settings travel alone."""
 
     ocp: OCP
-    f: ca.Function  # (x, u) -> xdot
+    f: ca.Function  # (x, u[, t][, p]) -> xdot
     N: int
     substeps: int = 1
     soft: bool = False  # path constraints as the penalty of ocp.L_soft, not as constraints
     backend: str = "ipopt"
     options: tuple[tuple[str, Any], ...] = ()
-    terminal: ca.Function | None = None  # (x) or (x, t) -> cost at the last node; default: G
+    terminal: ca.Function | None = None  # (x), (x, t) or (x, t, p) -> cost at the last node; default: G
     compiled: tuple[str, Path] | None = None  # (the program's key, cache folder) of compiled functions; or interpreted
 
     @cached_property
@@ -104,11 +106,16 @@ class Transcription:
         """Those of the problem under f."""
         return self.ocp.functions.on(self.f)
 
-    def end_cost(self, x: Any, t: Any) -> Any:
+    def end_cost(self, x: Any, t: Any, p: Any = None) -> Any:
         """What the state x at the last node, at time t, costs."""
         if self.terminal is None:
-            return self.ocp.G(x)
-        return self.terminal(*(x, t)[: self.terminal.n_in()])
+            return Arguments({"x": x, "p": p}).call(self.ocp.G)
+        return self.terminal(*(x, t, p)[: self.terminal.n_in()])
+
+    def moment(self, t: Array | float, p: Array | None) -> list[Array]:
+        """The times [n] and parameters p [np], as columns, that the problem's functions take behind x and u."""
+        n, p = np.size(t), np.zeros(0) if p is None else p
+        return self.functions.arguments.but("x", "u").columns(t=np.reshape(t, n), p=np.tile(p, (n, 1)))
 
     @property
     def expandable(self) -> bool:
@@ -121,31 +128,54 @@ class Transcription:
 
     @cached_property
     def step(self) -> ca.Function:
-        """(x, u, h) -> (x at the end of the interval, integral of L over it)."""
+        """(x, u[, t][, p], h) -> (x at the end of the interval, integral of L over it)."""
         return self.functions.step(soft=self.soft, substeps=self.substeps)
 
     @cached_property
     def rollout(self) -> ca.Function:
-        """(x0, u [nu, N], h [1, N]) -> x_1 ... x_N [nx, N]."""
+        """(x0, u [nu, N][, t [1, N]][, p [np, N]], h [1, N]) -> x_1 ... x_N [nx, N]."""
         return self.step.slice("F", range(self.step.n_in()), [0]).mapaccum(self.N)
+
+    def rolled(self, x0: Array, u: Array, t: Array, p: Array | None) -> Array:
+        """The states [N+1, nx] from x0 under controls u [N, nu] on the nodes t [N+1]."""
+        after = self.rollout(x0, u.T, *self.moment(t[:-1], p), np.diff(t)[None]).full().T
+        return np.vstack([x0, after])
+
+    def stepped(self, x: Array, u: Array, t: Array, k: int, p: Array | None) -> Array:
+        """The state at node k + 1 from x at node k of t [N+1], u held."""
+        return self.step(x, u, *self.moment(t[k], p), t[k + 1] - t[k])[0].full().ravel()
 
     @cached_property
     def program(self) -> dict[str, ca.MX]:
         """x, p, f, g of the nonlinear program, in MX."""
         s, N = self.ocp.system, self.N
-        X, U, p = ca.MX.sym("x", s.nx, N + 1), ca.MX.sym("u", s.nu, N), ca.MX.sym("p", s.nx + N + 1)
-        ends, costs = self.step.map(N)(X[:, :-1], U, p[s.nx: -1].T)
+        X, U = ca.MX.sym("x", s.nx, N + 1), ca.MX.sym("u", s.nu, N)
+        p = ca.MX.sym("p", s.nx + N + 1 + self.ocp.np)
+        h, end, own = p[s.nx: s.nx + N].T, p[s.nx + N], p[s.nx + N + 1:]
+        t = self._times(h, end) if self.ocp.uses_time else end
+        stages = Arguments({"x": X[:, :-1], "u": U, "t": t[:, :-1], "p": ca.repmat(own, 1, N)})
+        ends, costs = self.step.map(N)(*(stages[name] for name in self.functions.arguments.names), h)
         gaps = ca.horzsplit(X[:, 1:] - ends)
-        paths = [X[:, 0] - p[: s.nx], *([self.ocp.h(X[:, k]) for k in range(1, N + 1)] if self.n_path else [])]
+        nodes = (Arguments({"x": X[:, k], "t": t[min(k, t.numel() - 1)], "p": own}) for k in range(1, N + 1))
+        paths = [X[:, 0] - p[: s.nx], *([node.call(self.ocp.h) for node in nodes] if self.n_path else [])]
         w = ca.vertcat(*(v for k in range(N) for v in (X[:, k], U[:, k])), X[:, N])
         g = ca.vertcat(*(v for k in range(N) for v in (gaps[k], *paths[k: k + 1])), *paths[N:])
-        flat = ca.Function("flat", [X, U, p], [w, ca.sum2(costs) + self.end_cost(X[:, N], p[-1]), g])
+        flat = ca.Function("flat", [X, U, p], [w, ca.sum2(costs) + self.end_cost(X[:, N], end, own), g])
         w_sym, scales = ca.MX.sym("w", w.numel()), self.scales
         states, controls = self.split(w_sym if scales.ordinary else w_sym * scales.w)
         _, cost, constraints = flat(states, controls, p)
         if not scales.ordinary:
             cost, constraints = cost / scales.cost, constraints / scales.g
         return {"x": w_sym, "p": p, "f": cost, "g": constraints}
+
+    def _times(self, h: ca.MX, end: ca.MX) -> ca.MX:
+        """The times of the nodes [1, N+1] from the lengths of the intervals [1, N] and the time of the last one."""
+        left = ca.MX(0)
+        times = [end]
+        for length in reversed(ca.horzsplit(h)):
+            left = left + length
+            times.append(end - left)
+        return ca.horzcat(*reversed(times))
 
     @cached_property
     def scales(self) -> Scales:
@@ -219,14 +249,17 @@ class Transcription:
         first = np.r_[s.nx, 0, 2 * s.nx + (s.nx + m) * np.arange(N - 1)]
         return first[:, None] + np.arange(s.nx)
 
-    def solve(self, x0: Array, t: Array, x: Array, u: Array, time_limit: float | None = None) -> Answer:
+    def solve(self, x0: Array, t: Array, x: Array, u: Array, time_limit: float | None = None,
+              p: Array | None = None) -> Answer:
         """Solve from x0 on the nodes t [N+1] with the guess x [N+1, nx], u [N, nu], in a copy of this process.
 
+        p : the parameters [np], where there are some
         time_limit : seconds; default: `patience`, from what other solves took
         """
         begin = time.perf_counter()
         try:
-            answer: Answer = self._guarded(self.patience if time_limit is None else time_limit, x0, t, x, u)
+            answer: Answer = self._guarded(self.patience if time_limit is None else time_limit, x0, t, x, u,
+                                            np.zeros(0) if p is None else p)
         except NoAnswerError as error:
             return self._no_answer(x, u, f"was given up: {error}")
         self._took[0] = max(self._took[0], time.perf_counter() - begin)
@@ -275,9 +308,9 @@ class Transcription:
         """A failure of the solver itself, which leaves the guess."""
         return Answer(x, u, np.full_like(x, np.nan), np.inf, False, f"{self.backend} {why}", np.inf, 0, GIVEN_UP)
 
-    def _solve(self, x0: Array, t: Array, x: Array, u: Array) -> Answer:
+    def _solve(self, x0: Array, t: Array, x: Array, u: Array, own: Array) -> Answer:
         w0 = np.r_[np.c_[x[:-1], u].ravel(), x[-1]]
-        solver, p = self.solver, np.r_[x0, np.diff(t), t[-1]]
+        solver, p = self.solver, np.r_[x0, np.diff(t), t[-1], own]
         scales = self.scales
         try:
             result = solver(x0=w0 / scales.w, p=p, **self._limits)
@@ -299,7 +332,8 @@ class Transcription:
         if not success:
             status += f"; worst violation {where}" if worst > FEASIBLE else \
                 ", at a feasible point that may not be optimal"
-        return Answer(X, U, costate, cost if success else np.inf, success, status, worst, iterations, outcome)
+        V_p = -result["lam_p"].full().ravel()[len(p) - len(own):] * scales.cost if len(own) else None
+        return Answer(X, U, costate, cost if success else np.inf, success, status, worst, iterations, outcome, V_p)
 
     @property
     def max_iter(self) -> float:

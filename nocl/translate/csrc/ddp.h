@@ -16,16 +16,55 @@
 
    and SUBSTEPS, the Runge-Kutta steps in each interval, whose control is held over all of them.
 
+   A problem that holds the time or parameters has ND, TIMED (whether it holds the time) and NP too: its data d[ND] are t, where
+   TIMED, then the NP parameters, and every function above that takes x takes d as well, behind x and u; with NP > 0 also
+
+   stage_parameters(x, u, d, net, bend, mu, out)    out[NP] = d(mu'(xdot, L))/dp
+   terminal_parameters(x, d, out)                   out[NP] = dG/dp
+
+   The kernels take d_ [B, ND] behind h_, t at the start of each problem, and nocl_backward one more result, V_p [B, NP].
+
    Arrays are problem-major, rows as numpy has them: x [B, K+1, N], u [B, K, M], gains [B, K, M, N]. */
+#ifdef ND
+#define DATA_IN const lane *d,
+#define DATA d,
+#define BEGIN begin,
+#define NOW now,
+#define DATA_ARRAY const double *d_,
+#define GATHER_DATA lane begin[ND]; for (int i = 0; i < ND; ++i) begin[i] = gather(d_, at, ND, i);
+#define LATER(from, time, to) lane to[ND]; later(from, time, to);
+#define BY_P_ARRAY , double *by_p_
+#define BY_P_IN , lane *by_p
+#define BY_P , by_p
+
+/* The data of a problem a time later. */
+static void later(const lane *d, lane time, lane *now)
+{
+    for (int i = 0; i < ND; ++i) now[i] = TIMED && i == 0 ? d[i] + time : d[i];
+}
+#else
+#define DATA_IN
+#define DATA
+#define BEGIN
+#define NOW
+#define DATA_ARRAY
+#define GATHER_DATA
+#define LATER(from, time, to)
+#define BY_P_ARRAY
+#define BY_P_IN
+#define BY_P
+#endif
+
 /* One Runge-Kutta step, x to next; returns its cost. */
-static lane step(const double *weights, const lane *x, const lane *u, lane h, lane *next)
+static lane step(const double *weights, const lane *x, const lane *u, DATA_IN lane h, lane *next)
 {
     lane s[N], k[N + 1], net[NET + 1], cost = {0};
     for (int i = 0; i < N; ++i) next[i] = x[i];
     for (int j = 0; j < 4; ++j) {
         for (int i = 0; i < N; ++i) s[i] = j ? x[i] + reach[j] * h * k[i] : x[i];
-        network_values(weights, s, u, net);
-        field(s, u, net, k);
+        LATER(d, reach[j] * h, now)
+        network_values(weights, s, u, NOW net);
+        field(s, u, NOW net, k);
         for (int i = 0; i < N; ++i) next[i] += share[j] * h * k[i];
         cost += share[j] * h * k[N];
     }
@@ -34,7 +73,7 @@ static lane step(const double *weights, const lane *x, const lane *u, lane h, la
 
 /* u = clip(u_bar + alpha k + gain (x - x_bar)) from x0; writes x, u, J. */
 void nocl_rollout(int64_t first, int64_t last, const int64_t *index, int64_t K, const double *weights,
-                  const double *lb, const double *ub, const double *h_, const double *x0, const double *x_bar,
+                  const double *lb, const double *ub, const double *h_, DATA_ARRAY const double *x0, const double *x_bar,
                   const double *u_bar, const double *k, const double *gain, const double *alpha,
                   double *x_, double *u_, double *J)
 {
@@ -42,6 +81,7 @@ void nocl_rollout(int64_t first, int64_t last, const int64_t *index, int64_t K, 
         const int64_t *at = index + b * WIDTH;
         lane x[N], u[M], next[N], G[1], Gx[N], Gxx[N * N], cost = {0};
         const lane h = gather(h_, at, 1, 0), a = gather(alpha, at, 1, 0);
+        GATHER_DATA
         for (int i = 0; i < N; ++i) x[i] = gather(x0, at, N, i);
         for (int64_t t = 0; t < K; ++t) {
             lane dx[N];
@@ -56,12 +96,13 @@ void nocl_rollout(int64_t first, int64_t last, const int64_t *index, int64_t K, 
                 scatter(u_, at, K * M, t * M + j, u[j]);
             }
             for (int part = 0; part < SUBSTEPS; ++part) {
-                cost += step(weights, x, u, h / SUBSTEPS, next);
+                LATER(begin, (t + part / (double)SUBSTEPS) * h, now)
+                cost += step(weights, x, u, NOW h / SUBSTEPS, next);
                 for (int i = 0; i < N; ++i) x[i] = next[i];
             }
         }
         for (int i = 0; i < N; ++i) scatter(x_, at, (K + 1) * N, K * N + i, x[i]);
-        terminal(x, G, Gx, Gxx);
+        terminal(x, BEGIN G, Gx, Gxx);
         scatter(J, at, 1, 0, cost + G[0]);
     }
 }
@@ -180,23 +221,32 @@ static void feedback(lane L[M][M], lane Q[NZ][NZ], const mask *held, lane gain[M
 }
 
 /* The derivatives of one Runge-Kutta step from x, second ones along lam (see step_derivatives); returns its cost. */
-static lane derivatives(const double *weights, const lane *x, const lane *u, const lane *lam, lane h,
-                        lane *F, lane *l, lane *H)
+static lane derivatives(const double *weights, const lane *x, const lane *u, DATA_IN const lane *lam, lane h,
+                        lane *F, lane *l, lane *H BY_P_IN)
 {
     lane s[4][N], k[N + 1], net[4][NET + 1], tape[4][TAPE + 1], v[NV + 1], bend[BEND + 1];
     lane J[4 * NJ + 1], W[4 * NW + 1], mu[4 * (N + 1)], cost = {0};
     for (int j = 0; j < 4; ++j) {
         for (int i = 0; i < N; ++i) s[j][i] = j ? x[i] + reach[j] * h * k[i] : x[i];
-        network_slopes(weights, s[j], u, net[j], tape[j]);
-        field(s[j], u, net[j], k);
+        LATER(d, reach[j] * h, now)
+        network_slopes(weights, s[j], u, NOW net[j], tape[j]);
+        field(s[j], u, NOW net[j], k);
         cost += share[j] * h * k[N];
-        stage_jacobian(s[j], u, net[j], J + j * NJ);
+        stage_jacobian(s[j], u, NOW net[j], J + j * NJ);
     }
     stage_adjoints(J + NJ, J + 2 * NJ, J + 3 * NJ, lam, &h, mu);
     for (int j = 0; j < 4; ++j) {
-        network_weights(s[j], u, net[j], mu + j * (N + 1), v);
+        LATER(d, reach[j] * h, now)
+        network_weights(s[j], u, NOW net[j], mu + j * (N + 1), v);
         network_bend(weights, v, tape[j], bend);
-        stage_hessian(s[j], u, net[j], bend, mu + j * (N + 1), W + j * NW);
+        stage_hessian(s[j], u, NOW net[j], bend, mu + j * (N + 1), W + j * NW);
+#if defined(ND) && NP > 0
+        if (by_p) {
+            lane part[NP];
+            stage_parameters(s[j], u, now, net[j], bend, mu + j * (N + 1), part);
+            for (int i = 0; i < NP; ++i) by_p[i] += part[i];
+        }
+#endif
     }
     step_derivatives(J, W, &h, F, l, H);
     return cost;
@@ -249,17 +299,22 @@ static void earlier(const lane *F, const lane *l, const lane *H, lane Q[NZ][NZ],
     }
 }
 
-/* Q and q of an interval from V at its end; returns its cost. */
-static lane interval(const double *weights, const lane *x, const lane *u, lane h, const lane *Vx, const lane *Vxx,
-                     lane Q[NZ][NZ], lane *q)
+/* Q and q of an interval from V at its end; returns its cost. Adds to dV/dp where it is asked for. */
+static lane interval(const double *weights, const lane *x, const lane *u, DATA_IN lane h, const lane *Vx, const lane *Vxx,
+                     lane Q[NZ][NZ], lane *q BY_P_IN)
 {
     lane s[SUBSTEPS][N], F[N * NZ], l[NZ], H[NZ * NZ], cost;
     for (int i = 0; i < N; ++i) s[0][i] = x[i];
-    for (int part = 1; part < SUBSTEPS; ++part) step(weights, s[part - 1], u, h / SUBSTEPS, s[part]);
-    cost = derivatives(weights, s[SUBSTEPS - 1], u, Vx, h / SUBSTEPS, F, l, H);
+    for (int part = 1; part < SUBSTEPS; ++part) {
+        LATER(d, (part - 1) * h / SUBSTEPS, now)
+        step(weights, s[part - 1], u, NOW h / SUBSTEPS, s[part]);
+    }
+    LATER(d, (SUBSTEPS - 1) * h / SUBSTEPS, now)
+    cost = derivatives(weights, s[SUBSTEPS - 1], u, NOW Vx, h / SUBSTEPS, F, l, H BY_P);
     action_value(F, l, H, Vx, Vxx, Q, q);
     for (int part = SUBSTEPS - 2; part >= 0; --part) {
-        cost += derivatives(weights, s[part], u, q, h / SUBSTEPS, F, l, H);
+        LATER(d, part * h / SUBSTEPS, now)
+        cost += derivatives(weights, s[part], u, NOW q, h / SUBSTEPS, F, l, H BY_P);
         earlier(F, l, H, Q, q);
     }
     return cost;
@@ -289,19 +344,27 @@ static void value_update(lane Q[NZ][NZ], const lane *q, const lane *k, lane gain
 }
 
 /* The Riccati sweep about (x, u). Writes k, gain, slope = sum k'q, curve = sum k'Q k / 2, whether every Quu + mu D was
-   positive, and, where asked for (not NULL), V [B, K+1], V_x [B, K+1, N], V_xx [B, K+1, N, N]. */
+   positive, and, where asked for (not NULL), V [B, K+1], V_x [B, K+1, N], V_xx [B, K+1, N, N]; with parameters V_p [B, NP],
+   the gradient of the trajectory's cost, which is that of the optimum's. */
 void nocl_backward(int64_t first, int64_t last, const int64_t *index, int64_t K, const double *weights,
-                   const double *lb, const double *ub, const double *h_, const double *x_, const double *u_,
+                   const double *lb, const double *ub, const double *h_, DATA_ARRAY const double *x_, const double *u_,
                    const double *mu_, double *k_, double *gain_, double *slope_, double *curve_, double *positive_,
-                   double *V_, double *Vx_, double *Vxx_)
+                   double *V_, double *Vx_, double *Vxx_ BY_P_ARRAY)
 {
     for (int64_t b = first; b < last; ++b) {
         const int64_t *at = index + b * WIDTH;
         lane x[N], u[M], V[1], Vx[N], Vxx[N * N], slope = {0}, curve = {0};
         const lane h = gather(h_, at, 1, 0), reg = gather(mu_, at, 1, 0);
+        GATHER_DATA
         mask positive = all_lanes();
         for (int i = 0; i < N; ++i) x[i] = gather(x_, at, (K + 1) * N, K * N + i);
-        terminal(x, V, Vx, Vxx);
+        terminal(x, BEGIN V, Vx, Vxx);
+#ifdef ND
+        lane sums[NP + 1], *by_p = by_p_ ? sums : 0;
+#if NP > 0
+        if (by_p) terminal_parameters(x, begin, by_p);
+#endif
+#endif
         for (int64_t t = K;; --t) {
             if (V_) scatter(V_, at, K + 1, t, V[0]);
             if (Vx_) for (int i = 0; i < N; ++i) scatter(Vx_, at, (K + 1) * N, t * N + i, Vx[i]);
@@ -311,7 +374,8 @@ void nocl_backward(int64_t first, int64_t last, const int64_t *index, int64_t K,
             mask held[M];
             for (int i = 0; i < N; ++i) x[i] = gather(x_, at, (K + 1) * N, (t - 1) * N + i);
             for (int j = 0; j < M; ++j) u[j] = gather(u_, at, K * M, (t - 1) * M + j);
-            V[0] += interval(weights, x, u, h, Vx, Vxx, Q, q);
+            LATER(begin, (double)(t - 1) * h, now)
+            V[0] += interval(weights, x, u, NOW h, Vx, Vxx, Q, q BY_P);
             for (int i = 0; i < M; ++i)
                 for (int j = 0; j < M; ++j) Quu[i][j] = Q[N + i][N + j] + (i == j ? reg * DAMPED[i] : (lane){0});
             positive &= boxed_newton(Quu, q + N, u, lb, ub, held, k, L);
@@ -324,6 +388,9 @@ void nocl_backward(int64_t first, int64_t last, const int64_t *index, int64_t K,
             }
             value_update(Q, q, k, gain, Vx, Vxx);
         }
+#ifdef ND
+        if (by_p) for (int i = 0; i < NP; ++i) scatter(by_p_, at, NP, i, by_p[i]);
+#endif
         positive &= is_finite(slope) & is_finite(curve);
         scatter(slope_, at, 1, 0, slope);
         scatter(curve_, at, 1, 0, curve);

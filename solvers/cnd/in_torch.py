@@ -1,0 +1,69 @@
+"""An OCP in torch, as training uses it: f, L_soft and G of rows that have parameters of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from nocl.ocp import OCP
+from nocl.support.checks import Array
+from nocl.translate.rk4 import rk4_cost
+from nocl.translate.torch_functions import to_torch
+
+Function = Callable[..., Tensor]
+
+
+class InTorch:
+    """f, L_soft and G of a problem as torch functions of what they take among (x, u, t, p).
+
+    dynamics : (x, u[, t][, p of the system]) -> xdot in torch, as learned, in place of the exact f
+    """
+
+    def __init__(self, ocp: OCP, dynamics: Function | None = None) -> None:
+        self.ocp, self.timed = ocp, ocp.uses_time
+        names = ocp.functions.arguments.names
+        self.takes = {"f": names if dynamics is None else ocp.system.arguments.names, "L": names,
+                      "G": ocp.functions.end.names}
+        self.n_p = {"f": ocp.np if dynamics is None else ocp.system.np, "L": ocp.np, "G": ocp.np}
+        self.function = {"f": dynamics or to_torch(ocp.functions.f), "L": to_torch(ocp.L_soft), "G": to_torch(ocp.G)}
+
+    def at(self, p: Array) -> Rows:
+        """The problem for rows with parameters p [B, np]."""
+        return Rows(self, torch.from_numpy(p))
+
+    def call(self, name: str, **values: Any) -> Tensor:
+        given = [values[n][:, :self.n_p[name]] if n == "p" else values[n] for n in self.takes[name]]
+        return self.function[name](*given)
+
+
+class Rows:
+    """f, L and G of rows, row by row at its own parameters."""
+
+    def __init__(self, of: InTorch, p: Tensor) -> None:
+        self.of, self._p = of, p
+
+    @property
+    def p(self) -> list[Tensor]:
+        """What policies and values take after x and t: the parameters, if there are any."""
+        return [self._p] if self._p.shape[1] else []
+
+    def f(self, x: Tensor, u: Tensor, t: Tensor | None = None) -> Tensor:
+        return self.of.call("f", x=x, u=u, t=t, p=self._p)
+
+    def L(self, x: Tensor, u: Tensor, t: Tensor | None = None) -> Tensor:
+        return self.of.call("L", x=x, u=u, t=t, p=self._p)
+
+    def G(self, x: Tensor) -> Tensor:
+        return self.of.call("G", x=x, p=self._p)
+
+    def interval(self, x: Tensor, u: Tensor, t: Any, h: Any, substeps: int = 1) -> tuple[Tensor, Tensor]:
+        """(the states after intervals of length h from t on with u held, the integral of L_soft over them)."""
+        return rk4_cost(self.f, self.L, x, u, h, substeps, t if self.of.timed else None)
+
+    def after(self, x: Tensor, u: Tensor, t: Any, h: Any, substeps: int = 1) -> Tensor:
+        """The states alone."""
+        end, _ = rk4_cost(self.f, lambda *_: 0.0, x, u, h, substeps, t if self.of.timed else None)
+        return end
