@@ -199,6 +199,7 @@ def test_eased_penalties_are_never_dearer_and_the_same_near_the_edge():
     np.testing.assert_allclose(np.diff(less[deep]) / np.diff(depth[deep]), 0.3, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_obstacles_enter_as_the_soft_cost():
     ocp = nocl.load_ocp("double_integrator")
     wall = replace(ocp, path_constraints={"wall": 0.5 - ocp.system.x[0]}, penalty=100.0)
