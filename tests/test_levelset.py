@@ -111,6 +111,7 @@ def test_known_value_on_a_line_with_and_without_an_active_bound():
     np.testing.assert_allclose(bound.value(x), wanted, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_cost_that_is_not_quadratic_is_sampled():
     """L = |u|^4 / 4: H* = -3/4 |p|^(4/3), and V(x, 0) = c^4 / 4 + (x - c)^2 / 2 with c^3 = x - c."""
     ocp = turning("line", bounded=2.0, running=lambda u: u**4 / 4)
@@ -208,6 +209,7 @@ def test_obstacles_enter_as_the_soft_cost():
     assert held.value([-1.0, 0.0]) == pytest.approx(free.value([-1.0, 0.0]), rel=0.05)
 
 
+@pytest.mark.slow
 def test_what_is_too_large_is_refused_before_it_starts():
     ocp = nocl.load_ocp("double_integrator")
     with pytest.raises(ValueError, match=r"40000 x 40000 nodes would take about .* GB.*max_memory = 4 GB"):
