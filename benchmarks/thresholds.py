@@ -59,7 +59,9 @@ def ratio(small: Any, large: Any) -> float:
 def error(got: Any, wanted: Any, rtol: float, atol: float) -> float:
     """Error over tolerance, the worst over arrays."""
     a, b = np.broadcast_arrays(numbers(got), numbers(wanted))
-    return ratio(np.abs(a - b)[a != b], (atol + rtol * np.abs(b))[a != b])
+    a, b = a[a != b], b[a != b]
+    with np.errstate(invalid="ignore"):  # of numbers that are not finite
+        return ratio(np.abs(a - b), atol + rtol * np.abs(b))
 
 
 def off(got: Any, approx: Any) -> float:

@@ -558,7 +558,11 @@ def _goal_text(goal: Array) -> str:
 def _symbolic(goal: Any, n: int, name: str, owner: str) -> Any:
     """A user's goal as a CasADi column: numbers, or expressions of p."""
     goal = _goal_column(goal)
-    return goal if isinstance(goal, ca.SX) else ca.DM(checks.vector(goal, n, name, owner))
+    if not isinstance(goal, ca.SX):
+        return ca.DM(checks.vector(goal, n, name, owner))
+    if goal.shape != (n, 1):
+        raise ValueError(f"{owner}: {name} has shape {list(goal.shape)}; expected [{n}], numbers or expressions of p")
+    return goal
 
 
 def _goal_column(goal: Any) -> Any:

@@ -10,6 +10,7 @@ the costate there, and add up with those of the running cost.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 
@@ -18,10 +19,11 @@ from nocl.functions import Functions
 from nocl.ocp import OCP
 from nocl.sampling import own_numbers
 from nocl.scales import usual_sizes
-from nocl.substeps import FINEST, Grid, grid_of
+from nocl.substeps import FINEST, REMEDY, Grid, grid_of
 from nocl.support.checks import Array
 
 ROWS = 4  # solutions that are looked at
+APART = 0.1  # a plan that is off by more is none
 SMALL = 1e-3  # of the usual cost: below it, errors count as shares of that
 Stages = dict[str, Array]  # x [n, nx], u [n, nu], t [n], p [n, np]
 
@@ -31,8 +33,24 @@ def measured(ocp: OCP, functions: Functions, solution: Solution, substeps: int) 
     solution = solution[np.flatnonzero(solution.success)[:ROWS]]
     if not len(solution):
         return None
-    step = float(np.diff(solution.t, axis=1).max())
-    return grid_of(step, substeps, _errors(ocp, functions, solution), fastest(functions, _stages(solution)))
+    step, errors = float(np.diff(solution.t, axis=1).max()), _errors(ocp, functions, solution)
+    return grid_of(step, substeps, lambda n: float(errors(n).max()), fastest(functions, _stages(solution)))
+
+
+def followed(ocp: OCP, functions: Functions, solution: Solution, substeps: int) -> Solution:
+    """The same, where a grid is too coarse: rows whose plan is off by more than APART have failed, and say so."""
+    solved = np.flatnonzero(solution.success)
+    if not len(solved):
+        return solution
+    error = _errors(ocp, functions, solution[solved])(substeps)
+    lost, error = solved[error > APART], error[error > APART]
+    said = [f"not solved: with substeps={substeps} plan and plant differ by {100 * e:.3g} %: a singularity on the way, "
+            f"or {REMEDY}" for e in error]
+    message, cost, success = solution.message.tolist(), solution.cost.copy(), solution.success.copy()
+    for i, text in zip(lost, said, strict=True):
+        message[i] = text
+    cost[lost], success[lost] = np.inf, False
+    return replace(solution, message=np.array(message), cost=cost, success=success)
 
 
 def fastest_at_start(ocp: OCP, functions: Functions) -> float:
@@ -46,14 +64,14 @@ def firsts(ocp: OCP) -> tuple[Array, Array]:
     return ocp.initial_states.sample(ROWS, own_numbers(0)), ocp.sample_parameters(ROWS, own_numbers(0, 2))
 
 
-def _errors(ocp: OCP, functions: Functions, s: Solution) -> Callable[[int], float]:
-    """substeps -> the largest error."""
+def _errors(ocp: OCP, functions: Functions, s: Solution) -> Callable[[int], Array]:
+    """substeps -> the error of each row."""
     B, K, nx = len(s), s.u.shape[1], s.x.shape[2]
     x, h = s.x[:, :-1].reshape(-1, nx).T, np.diff(s.t, axis=1).reshape(1, -1)
     step, moment = functions.step(), _stages(s)
     usual = usual_sizes(ocp)
     cost, slope = np.maximum(np.abs(s.cost), SMALL * usual.cost), s.V_x[:, 1:].reshape(-1, nx).T
-    known: dict[int, float] = {}
+    known: dict[int, Array] = {}
 
     def after(n: int) -> tuple[Array, Array]:
         z, total = x, np.zeros((1, B * K))
@@ -66,14 +84,14 @@ def _errors(ocp: OCP, functions: Functions, s: Solution) -> Callable[[int], floa
     with np.errstate(all="ignore"):
         true, paid = after(FINEST)
 
-    def error(n: int) -> float:
+    def error(n: int) -> Array:
         if n not in known:
             with np.errstate(all="ignore"):
                 z, total = after(n)
                 off = np.abs(total - paid).ravel() + np.abs((slope * (z - true)).sum(axis=0))
-                parted = (np.abs(z - true) / usual.x[:, None]).max()
-                worst = max((off.reshape(B, K).sum(axis=1) / cost).max(), parted)
-            known[n] = float(worst) if np.isfinite(worst) else np.inf
+                parted = (np.abs(z - true) / usual.x[:, None]).max(axis=0).reshape(B, K).max(axis=1)
+                worst = np.maximum(off.reshape(B, K).sum(axis=1) / cost, parted)
+            known[n] = np.where(np.isfinite(worst), worst, np.inf)
         return known[n]
 
     return error

@@ -53,6 +53,7 @@ def bank() -> SolutionBank:
     return SolutionBank.of(cartpole(), found())
 
 
+@pytest.mark.slow
 def test_the_best_known_optimum_is_found_where_a_straight_start_misses():
     missed = straight().cost > 1.01 * best_known()
     assert missed.mean() > 0.1

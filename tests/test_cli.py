@@ -383,6 +383,7 @@ def test_a_controller_that_no_run_made_is_not_overwritten(here, capsys, monkeypa
     assert tree(here) == before
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on_from_the_last_finished_stage(here, capsys, monkeypatch):
     small(monkeypatch)
     with monkeypatch.context() as patched:

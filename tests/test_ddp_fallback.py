@@ -22,6 +22,7 @@ def both(name, K, n, dynamics=None, **guess):
     return [d.solve(x0, t0, curvature=True, **guess) for d in (compiled, slow)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "learned"), [("pendulum", False), ("acrobot", False), ("dubins", False),
                                                ("quadrotor", False), ("cartpole", True)])
 def test_numbers_are_the_compiled_ones(name, learned):

@@ -101,6 +101,7 @@ def test_generated_code_is_the_same_function(tmp_path):
                                atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_worker_process_gets_them_whole():
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         for f, got in zip(functions(), pool.map(rows, functions()), strict=True):

@@ -297,6 +297,44 @@ def logs() -> list[Call]:
     ]
 
 
+@cache
+def moving() -> tuple[nocl.System, nocl.OCP]:
+    """A double integrator of some mass, to some goal."""
+    (theta, omega, tau), mass, goal = symbols(), nocl.parameter("mass", 1.0, "kg"), nocl.parameter("goal")
+    s = nocl.System("moved", x=ca.vertcat(theta, omega), u=tau, p=mass, xdot=ca.vertcat(omega, tau / mass), lbu=[-5],
+                    ubu=[5], lbx=[-6, -8], ubx=[6, 8])
+    return s, nocl.OCP(s, p=goal, horizon=1.0, running=tau**2, terminal=(theta - goal)**2 + omega**2,
+                       x_goal=[goal, 0], u_goal=[0], initial_states=nocl.Uniform([-1, -1], [1, 1]),
+                       parameters=nocl.Uniform([0.5, -1], [2, 1]))
+
+
+def parameters() -> list[Call]:
+    (theta, _omega, tau), (s, o), at = symbols(), moving(), {"mass": 1.2, "goal": 0.3}
+    odd = [{"mass": 1.2}, {**at, "weight": 1}, {"mass": [1, 2, 3], "goal": 0}, {"mass": "1", "goal": 0}, [1.2],
+           [[1.2, 0.3]] * 3, [np.nan, 0], {"mass": 0.0, "goal": 0}, [1e300, -1e300]]
+    ddp, nmpc = DDP(o, intervals=4, substeps=1), NMPC(o, 4, starts=1, substeps=1)
+    return [
+        Call("parameter", nocl.parameter, {"name": "mass", "nominal": 1.0, "unit": "kg"}, lambda p: p.is_scalar()),
+        Call("System p", nocl.System, {"name": "moved", "x": s.x, "u": s.u, "p": s.p, "xdot": s.xdot, "lbu": [-5],
+             "ubu": [5], "lbx": [-6, -8], "ubx": [6, 8]}, bounded,
+             {"p": [s.x, nocl.time(), ca.vertcat(s.p, s.p), 2 * s.p, [s.p, 1]]}),
+        Call("OCP p", partial(nocl.OCP, s), {"p": o.p, "horizon": 1.0, "running": tau**2, "terminal": o.terminal,
+             "x_goal": [o.p, 0], "u_goal": [0], "initial_states": nocl.Uniform([-1, -1], [1, 1]),
+             "parameters": nocl.Uniform([0.5, -1], [2, 1])}, lambda found: found.np == 2,
+             {"p": [s.p, theta, nocl.time()], "x_goal": [[ca.SX.sym("q"), 0], [100 * o.p, 0], o.p],
+              "parameters": [nocl.Uniform([-1, -1], [1, 1]), nocl.Uniform([1], [2])]}),
+        Call("OCP.at", o.at, {"p": at}, lambda found: found.np == 0, {"p": odd}),
+        Call("System.at", s.at, {"p": {"mass": 1.2}}, lambda found: found.np == 0, {"p": odd}),
+        Call("System.linearize p", s.linearize, {"x": [0.1, 0.2], "u": [0.3], "t": 0.5, "p": [1.2]},
+             lambda AB: finite(AB[0], 2, 2) and finite(AB[1], 2, 1), {"p": odd}),
+        Call("simulate p", partial(nocl.simulate, o, lambda x, t, p: -x[:, :1], hold=4), {"x0": [0.1, 0.0], "p": at},
+             judged, {"p": odd}),
+        Call("DDP.solve p", ddp.solve, {"x0": [0.1, 0.0], "t0": 0.0, "p": at}, solved, {"p": odd}),
+        Call("NMPC.solve p", partial(nmpc.solve, progress=False, workers=1), {"x0": [0.1, 0.0], "p": at}, solved,
+             {"p": odd}),
+    ]
+
+
 def kinds_of_settings() -> list[Call]:
     kinds = (TrainSettings, PaperTraining, Settings, LogSettings, PaperSettings, DDPSettings)
     scaled = [Call(f"{k.__name__}.of", k.of, {"effort": "quick"}) for k in (TrainSettings, Settings, LogSettings)]
@@ -304,8 +342,9 @@ def kinds_of_settings() -> list[Call]:
 
 
 GROUPS = {"constructors": constructors, "problems": problems, "controllers": controllers, "solvers": solvers,
-          "logs": logs, "settings": kinds_of_settings}
-SHARES = {"constructors": 0.25, "problems": 0.2, "controllers": 0.15, "solvers": 0.15, "logs": 0.15, "settings": 0.1}
+          "logs": logs, "settings": kinds_of_settings, "parameters": parameters}
+SHARES = {"constructors": 0.2, "problems": 0.15, "controllers": 0.15, "solvers": 0.15, "logs": 0.15, "settings": 0.1,
+          "parameters": 0.1}
 
 
 def hold(group: str, calls: int) -> None:

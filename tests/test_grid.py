@@ -14,6 +14,7 @@ from nocl.solvers.ddp.solver import substeps_for
 from nocl.solvers.ddp.without_compiler import NumpyKernel
 from nocl.solvers.grid import measured
 from nocl.solvers.nmpc.solver import shared_program
+from nocl.solvers.nmpc.tasks import attempt
 from nocl.substeps import COARSE, FINE, TRIED, WANTED
 from nocl.sysid.settings import LogSettings
 from nocl.systems import NAMES
@@ -28,6 +29,15 @@ def lag(rate):
                          lbx=[-3, -2], ubx=[3, 2])
     return nocl.OCP(system, horizon=4.0, running=0.1 * u**2, terminal=5 * x**2 + z**2, x_goal=[0, 0], u_goal=[0],
                     initial_states=nocl.Gaussian(mean=X0, std=[0.1, 0.1]))
+
+
+def pole():
+    """A mass that a pole draws in: from X0 it gets there in finite time, whatever the control; RK4 steps over it."""
+    p, v, u = (ca.SX.sym(name) for name in "pvu")
+    system = nocl.System("pole", x=ca.vertcat(p, v), u=u, xdot=ca.vertcat(v, 1 / (1 - p) + 0.1 * u), lbu=[-1], ubu=[1],
+                         lbx=[-5, -5], ubx=[5, 5])
+    return nocl.OCP(system, horizon=3.0, running=0.1 * u**2 + p**2, terminal=p**2 + v**2, x_goal=[0, 0], u_goal=[0],
+                    initial_states=nocl.Gaussian([0.5, 0.0], [0.1, 0.1]))
 
 
 @pytest.mark.parametrize("substeps", [2, 3])
@@ -99,6 +109,53 @@ def test_left_to_themselves_solvers_take_as_many_as_the_plant_asks_for(make, rat
         warnings.simplefilter("ignore")
         kept = [make(lag(rate)).solve(X0, out=tmp_path) for _ in range(2)]
     assert kept[0].cost == kept[1].cost == pytest.approx(found.cost, rel=1e-6)
+
+
+@pytest.mark.parametrize("make", [lambda ocp, **given: DDP(ocp, intervals=20, **given),
+                                  lambda ocp, **given: NMPC(ocp, 20, starts=3, passes=0, time_limit=5.0, **given)])
+def test_a_plan_that_steps_over_a_singularity_is_not_solved(make):
+    x0 = np.array([[0.5, 0.5], [0.8, 0.2]])
+    shared_program.cache_clear()
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        solver = make(pole())
+        found = solver.solve(x0)
+    assert any("not even with substeps=32" in str(w.message) for w in said)
+    for again in (found, solver.solve(x0 + 1e-3)):
+        assert not again.success.any()
+        assert np.isinf(again.cost).all()
+    assert any("plan and plant differ" in message for message in found.message)
+    with pytest.warns(UserWarning, match="too coarse"):  # a grid of one's own is only told of
+        assert make(pole(), substeps=1).solve(x0).success.any()
+
+
+def test_what_one_nmpc_was_given_is_not_what_another_chooses():
+    ocp = lag(60.0)
+    shared_program.cache_clear()
+    with pytest.warns(UserWarning, match="too coarse"):
+        NMPC(ocp, 40, starts=1, passes=0, substeps=1).solve(X0)
+    left = NMPC(ocp, 40, starts=1, passes=0)
+    with pytest.warns(UserWarning, match="so they are taken"):
+        left.solve(X0)
+    assert left.settled.substeps > 1
+
+
+def test_where_nothing_is_solved_finer_steps_are_tried_on_a_few_states_alone(monkeypatch):
+    """A wall that comes faster than x can go: 20 states with one step, three with each other number."""
+    tried = []
+
+    def counted(program, task, guesses):
+        tried.append((program.substeps, task.row))
+        return attempt(program, task, guesses)
+
+    monkeypatch.setattr("nocl.solvers.nmpc.solver.attempt", counted)
+    ocp = lag(60.0)
+    ocp = replace(ocp, path_constraints={"wall": ocp.system.x[0] - 0.5 - 2 * nocl.time()})
+    x0 = ocp.initial_states.sample(20, 0)
+    with pytest.warns(UserWarning, match="nothing was solved, not even with substeps=32"):
+        found = NMPC(ocp, 40, starts=1, passes=0).solve(x0, workers=1)
+    assert not found.success.any()
+    assert sorted(n for n, _ in tried) == [1] * 20 + [4] * 3 + [16] * 3 + [32] * 3
 
 
 def test_nmpc_tells_its_program_with_the_substeps_that_were_chosen():

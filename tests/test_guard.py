@@ -132,10 +132,10 @@ def stuck_from(monkeypatch):
     def make(limit, backends=("fatrop",)):
         original = Transcription._solve
 
-        def solve(self, x0, t, x, u):
+        def solve(self, x0, t, x, u, p):
             if self.backend in backends and x0[0] > limit:
                 time.sleep(3600.0)
-            return original(self, x0, t, x, u)
+            return original(self, x0, t, x, u, p)
 
         monkeypatch.setattr(Transcription, "_solve", solve)
         shared_program.cache_clear()

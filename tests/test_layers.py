@@ -9,6 +9,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -35,6 +36,17 @@ def files() -> dict[str, Path]:
 FILES = files()
 
 
+@cache
+def tree_of(name: str) -> ast.Module:
+    return ast.parse(FILES[name].read_text())
+
+
+@cache
+def nodes_of(name: str) -> list[ast.AST]:
+    """All of a file's statements and expressions."""
+    return list(ast.walk(tree_of(name)))
+
+
 def is_package(name: str) -> bool:
     return FILES[name].name == "__init__.py"
 
@@ -50,13 +62,11 @@ def module_of(name: str) -> str:
     return name
 
 
-def imports(name: str) -> Iterator[tuple[str, str]]:
+@cache
+def imports(name: str) -> list[tuple[str, str]]:
     """(module, as written) of each import of nocl's, wherever it stands."""
-    for node in ast.walk(ast.parse(FILES[name].read_text())):
-        if isinstance(node, ast.Import):
-            yield from ((module_of(a.name), a.name) for a in node.names if a.name.partition(".")[0] == "nocl")
-        elif isinstance(node, ast.ImportFrom) and (node.module or "").partition(".")[0] == "nocl":
-            yield from ((module_of(f"{node.module}.{a.name}"), f"{node.module}.{a.name}") for a in node.names)
+    written = [w for node in nodes_of(name) for w in names_of(node) if w.partition(".")[0] == "nocl"]
+    return [(module_of(w), w) for w in written]
 
 
 def handed_on(name: str) -> bool:
@@ -126,7 +136,7 @@ def test_names_come_from_the_module_that_defines_them(name):
 
 def defined_in(package: str, name: str) -> bool:
     """Whether a package's own __init__.py defines a name, rather than handing it on."""
-    body = ast.parse(FILES[package].read_text()).body
+    body = tree_of(package).body
     defined = {n.name for n in body if isinstance(n, ast.FunctionDef | ast.ClassDef)}
     assigned = {t.id for n in body if isinstance(n, ast.Assign) for t in n.targets if isinstance(t, ast.Name)}
     return name in defined | (assigned - {"__getattr__", "__dir__"})
@@ -134,26 +144,32 @@ def defined_in(package: str, name: str) -> bool:
 
 @pytest.mark.parametrize("name", FILES)
 def test_packages_are_imported_by_their_nocl_name(name):
-    tree = ast.parse(FILES[name].read_text())
-    names = [a.name for n in ast.walk(tree) if isinstance(n, ast.Import) for a in n.names]
-    names += [n.module or "" for n in ast.walk(tree) if isinstance(n, ast.ImportFrom) and not n.level]
+    names = [a.name for n in nodes_of(name) if isinstance(n, ast.Import) for a in n.names]
+    names += [n.module or "" for n in nodes_of(name) if isinstance(n, ast.ImportFrom) and not n.level]
     bare = [t for t in names if t.partition(".")[0] in PACKAGES]
     assert not bare, f"{name} imports {bare}: write nocl.{bare[0]}"
 
 
-def loads(name: str, seen: set[str] | None = None) -> set[str]:
+@cache
+def loads(name: str) -> set[str]:
     """The heavy libraries that importing a module brings, by the imports at the top of it and of what it imports."""
-    seen = set() if seen is None else seen
-    if name in seen:
-        return set()
-    seen.add(name)
-    found = set()
-    body = ast.parse(FILES[name].read_text()).body
-    for node in [n for top in body for n in (top.body if isinstance(top, ast.Try) else [top])]:
-        for written in names_of(node):
-            library = written.partition(".")[0].lower()
-            found |= loads(module_of(written), seen) if library == "nocl" else {library} & HEAVY
+    found, seen, left = set(), set(), [name]
+    while left:
+        seen.add(now := left.pop())
+        libraries, modules = at_the_top(now)
+        found |= libraries
+        left += modules - seen
     return found
+
+
+@cache
+def at_the_top(name: str) -> tuple[set[str], set[str]]:
+    """(heavy libraries, modules of nocl) that a module imports itself, outside functions."""
+    body = tree_of(name).body
+    nodes = [n for top in body for n in (top.body if isinstance(top, ast.Try) else [top])]
+    written = [name for node in nodes for name in names_of(node)]
+    own = {module_of(w) for w in written if w.partition(".")[0] == "nocl"}
+    return {w.partition(".")[0].lower() for w in written} & HEAVY, own
 
 
 def names_of(node: ast.AST) -> list[str]:
@@ -165,9 +181,8 @@ def names_of(node: ast.AST) -> list[str]:
 
 def inside_functions(name: str) -> Iterator[tuple[str, str]]:
     """(what is imported, the comment behind it) of each import inside a function."""
-    source = FILES[name].read_text()
-    lines = source.splitlines()
-    functions = [n for n in ast.walk(ast.parse(source)) if isinstance(n, ast.FunctionDef)]
+    lines = FILES[name].read_text().splitlines()
+    functions = [n for n in nodes_of(name) if isinstance(n, ast.FunctionDef)]
     for node in {n.lineno: n for f in functions for n in ast.walk(f) if names_of(n)}.values():
         for written in names_of(node):
             yield written, lines[node.lineno - 1].partition("#")[2].lower()

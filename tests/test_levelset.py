@@ -111,6 +111,7 @@ def test_known_value_on_a_line_with_and_without_an_active_bound():
     np.testing.assert_allclose(bound.value(x), wanted, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_a_cost_that_is_not_quadratic_is_sampled():
     """L = |u|^4 / 4: H* = -3/4 |p|^(4/3), and V(x, 0) = c^4 / 4 + (x - c)^2 / 2 with c^3 = x - c."""
     ocp = turning("line", bounded=2.0, running=lambda u: u**4 / 4)
@@ -199,6 +200,7 @@ def test_eased_penalties_are_never_dearer_and_the_same_near_the_edge():
     np.testing.assert_allclose(np.diff(less[deep]) / np.diff(depth[deep]), 0.3, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_obstacles_enter_as_the_soft_cost():
     ocp = nocl.load_ocp("double_integrator")
     wall = replace(ocp, path_constraints={"wall": 0.5 - ocp.system.x[0]}, penalty=100.0)
@@ -207,6 +209,7 @@ def test_obstacles_enter_as_the_soft_cost():
     assert held.value([-1.0, 0.0]) == pytest.approx(free.value([-1.0, 0.0]), rel=0.05)
 
 
+@pytest.mark.slow
 def test_what_is_too_large_is_refused_before_it_starts():
     ocp = nocl.load_ocp("double_integrator")
     with pytest.raises(ValueError, match=r"40000 x 40000 nodes would take about .* GB.*max_memory = 4 GB"):

@@ -232,6 +232,7 @@ def test_what_is_kept_is_the_best_on_held_out_states():
         assert float(trainer.loss(trainer.terms(trainer.held_out))) == trainer.lowest
 
 
+@pytest.mark.slow
 def test_training_comes_near_the_optimum():
     """What the judged cost is above LQR's, which is least, falls to a tenth or less: 3 to 5 % of it, by the seed."""
     ocp = double_integrator.ocp(R=0.3, horizon=1.5)

@@ -89,6 +89,7 @@ def test_what_ships_is_judged_without_training(tmp_path):
     assert f"| {card['seconds']:.0f} |" in QUADROTOR_TABLE.markdown(entries)
 
 
+@pytest.mark.slow
 def test_nmpc_runs_in_closed_loop(tmp_path):
     made = QUADROTOR_TABLE.make(Plan(n=1), Place("quadrotor", "nmpc"), tmp_path)
     x0 = nocl.load_ocp("quadrotor").initial_states.sample(1, control.HIDDEN)

@@ -182,6 +182,7 @@ def test_the_widest_network_has_half_as_many_weights_as_labels(features, outputs
     assert weights(h + 1) > rows * outputs / 2
 
 
+@pytest.mark.slow
 def test_few_labels_are_learned_by_a_narrow_network_and_jacobians_help_there():
     """100 of cart-pole: 32 wide it was 0.0065 with Jacobians and 1.1 without."""
     data = Dataset.sample(cartpole.system(), 100, 7)

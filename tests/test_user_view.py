@@ -11,10 +11,13 @@ import pytest
 import nocl
 from nocl import comparisons
 from nocl.solvers.cnd import TrainSettings
+from nocl.sysid.settings import Settings
 
 README = Path(__file__).parents[1] / "README.md"
 SMALL = TrainSettings(seeds=4, starts=4, states=20, tails=60, visits=40, rounds=1, iterations=60, value_initial=10,
                       value_iterations=40, held_out=8, hidden=(16, 16))
+
+QUICK = Settings.of("quick")
 
 
 def blocks() -> list[str]:
@@ -25,6 +28,7 @@ def test_the_users_view_runs(tmp_path, monkeypatch):
     pytest.importorskip("l4casadi")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(nocl, "train", partial(nocl.train, settings=SMALL), raising=False)
+    monkeypatch.setattr(nocl, "identify", partial(nocl.identify, settings=QUICK), raising=False)
     monkeypatch.setattr(comparisons, "compare", partial(_compare_few, comparisons.compare))
     names: dict[str, object] = {}
     exec(compile(blocks()[0], str(README), "exec"), names)

@@ -46,6 +46,10 @@ def problems() -> dict[str, tuple[Callable[[], nocl.OCP], list[float]]]:
         "a cost that is inf at the start": (lambda: mass({}, L=lambda p, v, u: u**2 + 1 / (4 - p) ** 2), [4.0, 0.0]),
         "a root of what gets negative": (lambda: mass({}, L=lambda p, v, u: u**2 + ca.sqrt(3 + v)), [0.0, -4.9]),
         "an end cost that is NaN": (lambda: mass({}, G=lambda p, v: ca.log(4 - p)), [4.8, 4.8]),
+        "a wall that comes too fast": (lambda: mass({"wall": lambda p, v: p + 1 - 2 * nocl.time()}), [0, 0]),
+        "a gate that shuts": (lambda: mass({"gate": lambda p, v: 2 * (nocl.time() - 1) ** 2 - p}), [2.0, 0.0]),
+        "a pull without end": (lambda: mass({}, f=lambda p, v, u: 1 / (1 - p) + 0.1 * u), [0.9, 1.0]),
+        "an end cost that falls without end": (lambda: mass({}, G=lambda p, v: ca.log(p**2 + v**2)), [0.5, 0.0]),
     }
 
 

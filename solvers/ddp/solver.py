@@ -32,7 +32,7 @@ from nocl.scales import usual_sizes
 from nocl.solvers.ddp.batch import Job, Piece, Rows, assembled, pieces
 from nocl.solvers.ddp.kernel import ddp_source, pack_weights
 from nocl.solvers.ddp.without_compiler import ddp_kernel
-from nocl.solvers.grid import fastest_at_start, firsts, measured
+from nocl.solvers.grid import fastest_at_start, firsts, followed, measured
 from nocl.substeps import COARSE, Grid, settled
 from nocl.support import checks
 from nocl.support.checks import Array
@@ -103,7 +103,8 @@ class DDP:
             checks.instance(DDPSettings, settings, "settings", "DDP", "DDPSettings(max_iterations=...)")
         self.ocp, self.intervals, self.settings = ocp, int(intervals), settings or DDPSettings()
         self.constraints, self.dynamics, self.cache = constraints, dynamics, cache
-        self.checked = False  # whether the grid was held against the plant
+        self.checked = self.coarse = False  # whether the grid was held against the plant, and is too coarse for it
+        self.left = substeps is None  # whether the grid was left to nocl
         self.threads = int(threads or os.cpu_count() or 1)
         self.evaluations: Counter[str] = Counter()  # of f in this process, one for each state: "rollout", "backward"
         net = None if dynamics is None else _fitting(ocp, dynamics)
@@ -151,17 +152,18 @@ class DDP:
         show = sys.stderr.isatty() if progress is None else progress
         tasks = pieces(self, rows, times, guess, curvature, values)
         solution = assembled(len(rows), stream(Job(here), tasks, pool, journal, show, f"DDP, {self.ocp.system.name}"))
-        self._check_grid(solution)
-        return solution
+        return self._held_against_plant(solution)
 
-    def _check_grid(self, solution: Solution) -> None:
-        """Warns, once, where the first solutions show a grid that is too coarse."""
-        if self.checked or not solution.success.any():
-            return
-        self.checked = True
-        grid = measured(self.ocp, _functions(self.ocp, self.dynamics), solution, self.substeps)
-        if grid is not None and grid.coarse:
-            warnings.warn(f"DDP of {self.ocp.system.name}: {grid}", stacklevel=3)
+    def _held_against_plant(self, solution: Solution) -> Solution:
+        """Warns, once, where the first solutions show a grid that is too coarse; rows far off fail if it was nocl's."""
+        functions = _functions(self.ocp, self.dynamics)
+        if not self.checked and solution.success.any():
+            self.checked = True
+            grid = measured(self.ocp, functions, solution, self.substeps)
+            self.coarse = grid is not None and grid.coarse
+            if self.coarse:
+                warnings.warn(f"DDP of {self.ocp.system.name}: {grid}", stacklevel=3)
+        return followed(self.ocp, functions, solution, self.substeps) if self.coarse and self.left else solution
 
     def descend(self, batch: Piece) -> Solution:
         """Solve one piece of a batch, here."""

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 from nocl.data import Solution, Trajectory
 from nocl.judge import check_made_for, dynamics_function
 from nocl.ocp import OCP
-from nocl.solvers.grid import fastest_at_start, measured
+from nocl.solvers.grid import fastest_at_start, followed, measured
 from nocl.solvers.lqr import LQR
 from nocl.solvers.mirrors import Mirror, mirrors
 from nocl.solvers.nmpc import guesses as starting
@@ -36,6 +36,7 @@ from nocl.support.fingerprint import fingerprint
 from nocl.support.pool import Journal, Pool, do
 
 KEPT = 32  # programs kept in memory
+PROBES = 3  # states on which more substeps are tried where nothing was solved
 
 
 @dataclass(frozen=True, eq=False)
@@ -197,35 +198,47 @@ class NMPC:
         if n < 1 and not given:
             raise ValueError(f"starts is {n}; expected at least 1, or guesses")
         show = sys.stderr.isatty() if progress is None else progress
-        call = _Call(rows, t, values, given, warm, n, Pool(workers), None if out is None else Path(out), show)
+        call = _Call(rows, t, values, given, warm, n, self.passes if n else 0, Pool(workers),
+                     None if out is None else Path(out), show)
         solution = self._settle(call) if self.substeps is None else self._told(self._search(call))
         return self.with_gains(solution) if gains else solution
 
     def _settle(self, call: _Call) -> Solution:
         """Solved with as few substeps as the first solutions are right with, which is remembered.
 
-        In a folder all that is asked there begins with 1, so that the same call finds what it left.
+        In a folder all that is asked there begins with 1, so that the same call finds what it left. Where nothing was
+        solved, more substeps are first tried on a few states, from one start each.
         """
         known = self._with(1)._program.settled
         if "substeps" in known and call.out is None:
-            return self.settled._search(call)
-        found = dict[int, Solution]()
+            solution = self.settled._search(call)
+            return self._followed(solution, known["substeps"]) if known["coarse"] else solution
+        functions, step = self._with(1)._program.functions, float(np.diff(call.t).max())
+        found, grids = dict[int, Solution](), dict[int, Grid | None]()
 
         def ask(substeps: int) -> Grid | None:
-            s = found[substeps] = self._with(substeps)._search(call.within(substeps))
-            return measured(self.ocp, self._with(substeps)._program.functions, s, substeps)
+            finer = self._with(substeps)
+            hope = not found or any(s.success.any() for s in found.values())
+            if not hope and not finer._search(call.few()).success.any():
+                return None
+            s = found[substeps] = finer._search(call.within(substeps))
+            grids[substeps] = measured(self.ocp, functions, s, substeps)
+            return grids[substeps]
 
-        functions, step = self._with(1)._program.functions, float(np.diff(call.t).max())
         substeps = settled(f"NMPC of {self.ocp.system.name}", ask, step, lambda: fastest_at_start(self.ocp, functions))
+        grid = grids[substeps]
         if any(s.success.any() for s in found.values()):
-            known["substeps"] = substeps
-        return found[substeps]
+            known.update(substeps=substeps, coarse=grid is not None and grid.coarse)
+        return self._followed(found[substeps], substeps) if grid is not None and grid.coarse else found[substeps]
+
+    def _followed(self, solution: Solution, substeps: int) -> Solution:
+        return followed(self.ocp, self._with(1)._program.functions, solution, substeps)
 
     def _told(self, solution: Solution) -> Solution:
         """The same; a warning, once for each program, where the first solutions show a grid that is too coarse."""
         p = self.program
-        if "substeps" not in p.settled and solution.success.any():
-            p.settled["substeps"] = p.substeps
+        if "told" not in p.settled and solution.success.any():
+            p.settled["told"] = True
             grid = measured(self.ocp, p.functions, solution, p.substeps)
             if grid is not None and grid.coarse:
                 warnings.warn(f"NMPC of {self.ocp.system.name}: {grid}", stacklevel=3)
@@ -235,9 +248,8 @@ class NMPC:
         """Solved with this number of substeps."""
         key = self._run_key(call.x0, call.t, call.p, call.given, call.starts, call.warm) if call.out else ""
         states = _States(self, call, Journal(call.out, key))
-        rounds = self.passes if call.starts else 0
-        search = Search(states, self.ocp, self.mirrors if rounds else [], call.x0, call.t, neighbours=self.neighbours,
-                        rounds=rounds, seed=self.seed, p=call.p)
+        search = Search(states, self.ocp, self.mirrors if call.passes else [], call.x0, call.t,
+                        neighbours=self.neighbours, rounds=call.passes, seed=self.seed, p=call.p)
         search.stage("NMPC", search.cold, np.arange(len(call.x0)), 0, call.starts)
         search.improve(call.starts)
         return states.finished(search.solution())
@@ -344,6 +356,7 @@ class _Call:
     given: list[list[Guess]]
     warm: int  # how many of these, the first ones, are solutions
     starts: int
+    passes: int
     pool: Pool
     out: Path | None
     show: bool
@@ -351,6 +364,13 @@ class _Call:
     def within(self, substeps: int) -> _Call:
         """The same, what it keeps in a folder of its own for more substeps than 1."""
         return self if substeps == 1 or self.out is None else replace(self, out=self.out / f"substeps-{substeps}")
+
+    def few(self) -> _Call:
+        """At most PROBES of its states, from their guesses and one start each; nothing is kept in a folder."""
+        some = np.unique(np.linspace(0, len(self.x0) - 1, PROBES).astype(int))
+        given = [[guess[i] for i in some] for guess in self.given]
+        return replace(self, x0=self.x0[some], p=self.p[some], given=given, starts=min(self.starts, 1), passes=0,
+                       out=None)
 
 
 @dataclass(frozen=True)

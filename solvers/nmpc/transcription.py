@@ -278,7 +278,8 @@ class Transcription:
 
     @cached_property
     def settled(self) -> dict[str, int]:
-        """`substeps` that its first solutions have asked for, once they were held against the plant."""
+        """What its first solutions have shown once they were held against the plant: `substeps` that they ask for,
+        whether that is still `coarse`; and whether it was `told` of a program with a number of its own."""
         return {}
 
     @cached_property
