@@ -156,6 +156,12 @@ class OCP:
         """Where parameters lie, [np] and [np]: of a Gaussian the usual range."""
         return (np.zeros(0), np.zeros(0)) if self.parameters is None else box(self.parameters)
 
+    @property
+    def plant_parameters(self) -> Distribution | None:
+        """Where the system's own parameters lie, the first ones of all; None where it has none."""
+        low, high = (bound[:self.system.np] for bound in self.parameter_box)
+        return Uniform(low, high) if self.system.np else None
+
     def _at(self, p: Array) -> str:
         """Which parameters are meant, in words; "" where there are none."""
         named = (f"{name} = {value:.4g}" for name, value in zip(self.parameter_names, p, strict=True))

@@ -156,6 +156,11 @@ class System:
         return parameters.names_of(self.p)
 
     @property
+    def input_names(self) -> tuple[str, ...]:
+        """Those of the controls, then of the parameters: what logs and labels of f have beside states."""
+        return self.control_names + self.parameter_names
+
+    @property
     def nominal(self) -> Array:
         """The nominal values of the parameters [np], NaN where none was given."""
         return parameters.nominal_of(self.p)

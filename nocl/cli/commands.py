@@ -199,15 +199,10 @@ def _problem(args: argparse.Namespace) -> tuple[OCP, Path]:
 
 
 def _check_learnable(ocp: OCP) -> None:
-    """ValueError where dynamics are to be learned of a system with parameters or time."""
-    s = ocp.system
-    if s.np:
-        raise ValueError(f"learned dynamics are not implemented for parameters, and the system {s.name!r} has "
-                         f"{', '.join(s.parameter_names)}; expected one without: give {registry.asked(ocp)}, or train "
-                         "on the equations, --exact")
-    if s.uses_time:
-        raise ValueError(f"learned dynamics are not implemented for the time t, which the system {s.name!r} holds; "
-                         "expected one without: train on the equations, --exact")
+    """ValueError where dynamics are to be learned of a system that holds the time."""
+    if ocp.system.uses_time:
+        raise ValueError("learned dynamics are not implemented for the time t, which the system "
+                         f"{ocp.system.name!r} holds; expected one without: train on the equations, --exact")
 
 
 def _run(args: argparse.Namespace) -> None:

@@ -75,7 +75,7 @@ class RunFolder:
         start = time.perf_counter()
         checkpoint = self.folder / "checkpoint" / "dynamics"
         model = identify(self.ocp.system, seed=self.seed, settings=Settings.of(self.effort),
-                         checkpoint=checkpoint)
+                         checkpoint=checkpoint, parameters=self.ocp.plant_parameters)
         model = replace(model, card={**model.card, KEY: made_from})
         model.save(self.folder / "dynamics")
         _forget(checkpoint)
@@ -93,12 +93,13 @@ class RunFolder:
             say(f"dynamics: taken from {self.folder / 'dynamics'} ({there.card['score']})")
             return there
         say(f"dynamics: {log!r}" + _anew(there))
-        settings = LogSettings.of(self.effort)
+        settings, where = LogSettings.of(self.effort), self.ocp.plant_parameters
         start = time.perf_counter()
-        model = identify(self.ocp.system, data=log, seed=self.seed, settings=settings, **stated)
+        model = identify(self.ocp.system, data=log, seed=self.seed, settings=settings, parameters=where, **stated)
         if len({r.run for r in log}) > 1:
             train, test = log.split(seed=self.seed)
-            held = identify(self.ocp.system, data=train, seed=self.seed, settings=settings, **stated)
+            held = identify(self.ocp.system, data=train, seed=self.seed, settings=settings, parameters=where,
+                            **stated)
             say(f"learned from four fifths of the recordings, simulated on the others:\n{held.validate(test)}")
         outside = int(model.outside(fresh_states(self.ocp, 100, self.seed)).sum())
         if outside:

@@ -12,6 +12,7 @@ import time
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,12 +22,13 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from nocl import records
+from nocl import records, sampling
 from nocl.data import Dataset
 from nocl.exports.casadi_forms import to_casadi
 from nocl.exports.parity import ExportPart
 from nocl.nets import MLP, FeatureNet
-from nocl.sampling import Seed
+from nocl.parameters import rows as parameter_rows
+from nocl.sampling import Distribution, Gaussian, Seed, Uniform
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.support.store import reading
@@ -41,6 +43,7 @@ from nocl.sysid.logs.log import Log
 from nocl.sysid.logs.shooting import WindowFit
 from nocl.sysid.logs.validation import HORIZONS, Validation, validate
 from nocl.sysid.networks import assemble, fit_group, fit_groups, weights_of
+from nocl.sysid.parameters import apart, together, widened
 from nocl.sysid.progress import Checkpoint, Progress
 from nocl.sysid.score import Score, contradictions, score_of
 from nocl.sysid.settings import LogSettings, PaperSettings, Settings
@@ -61,7 +64,7 @@ NO_BETTER = 0.5  # of the error of standing still: a model of a log that is warn
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LearnedDynamics:
-    """xdot = f_theta(x, u): torch rows x [B, nx], u [B, nu] in float64 -> [B, nx].
+    """xdot = f_theta(x, u[, p]): torch rows x [B, nx], u [B, nu], p [B, np] in float64 -> [B, nx].
 
     The system gives names, boxes and, in `score` and `refine` only, the exact f to compare with or to ask for labels.
     """
@@ -72,9 +75,22 @@ class LearnedDynamics:
     card: Mapping[str, Any] = field(default_factory=dict)  # how it was made: method, seed, settings, labels, score
     parts: Structure | None = None  # the structure itself; None for a network that learned everything
     coverage: Coverage | None = None  # where the log has been that it was learned from
+    parameters: Distribution | None = None  # of the system's parameters, where it has some: where f_theta was taught
 
-    def __call__(self, x: Tensor, u: Tensor) -> Tensor:
-        return self.net(x, u)
+    def __call__(self, x: Tensor, u: Tensor, *p: Tensor) -> Tensor:
+        return self.net(x, u, *p)
+
+    @cached_property
+    def widened(self) -> LearnedDynamics:
+        """The same model with the parameters after the controls, as u [B, nu + np]; itself where there are none."""
+        s = self.system
+        if not s.np:
+            return self
+        return replace(self, system=widened(s, self.parameters), net=together(self.net, s), parameters=None)
+
+    def _of(self, plant: System, parameters: Distribution | None) -> LearnedDynamics:
+        """A model with parameters among its controls, as one of the plant that has them apart."""
+        return replace(self, system=plant, net=apart(self.net, plant), parameters=parameters) if plant.np else self
 
     def to_casadi(self) -> ca.Function:
         """f:(x, u)->(xdot), native MX, equal to torch to rounding; with t and p, where the network has them."""
@@ -85,8 +101,10 @@ class LearnedDynamics:
         """What nocl.exports.bundle.export writes: f_theta."""
         s = self.system
         box = {"x": (s.lbx, s.ubx), "u": (s.lbu, s.ubu)}
-        labels = {"x": [s.unit(n) for n in s.state_names], "u": [s.unit(n) for n in s.control_names],
-                  "xdot": [f"d {n} / dt" for n in s.state_names]}
+        labels = {"x": [s.unit(n) for n in s.state_names], "u": [s.unit(n) for n in s.control_names]}
+        if self.parameters is not None:
+            box["p"], labels["p"] = sampling.box(self.parameters), [s.unit(n) for n in s.parameter_names]
+        labels = {**labels, "xdot": [f"d {n} / dt" for n in s.state_names]}
         net = copy.deepcopy(self.net).double().eval()
         return [ExportPart("dynamics", self.to_casadi(), net, box, labels, net)]
 
@@ -99,6 +117,8 @@ class LearnedDynamics:
 
     def validate(self, log: Log, steps: Sequence[int] = HORIZONS, *, every: int | None = None) -> Validation:
         """Errors of simulations of f_theta from a log's states, by number of steps: see nocl.sysid.logs.validation."""
+        if self.system.np:
+            return self.widened.validate(log, steps, every=every)
         log.check(self.system)
         settings = self.card.get("settings", {})  # where cards had them before
         return validate(self.net, log, steps, every, int(self.card.get("substeps", settings.get("substeps", 1))))
@@ -124,24 +144,35 @@ class LearnedDynamics:
 
     def plot(self) -> Figure:
         """f_theta, and the exact f where it is known, along each variable through the middle of the box."""
-        return slices(self.system, self)
+        wide = self.widened
+        return slices(wide.system, wide)
 
     def score(self, n: int = 2000, seed: Seed = 1_000_003) -> Score:
-        """Errors against the exact f at n fresh uniform samples of the box X x U; ValueError where f is not known."""
+        """Errors against the exact f at n fresh uniform samples of the box of x, u and p; ValueError where f is not
+        known."""
         if self.system.xdot is None:
             raise ValueError(f"score: the equations of {self.system.name!r} are not known, there is nothing to compare "
                              "with: model.validate(log) has the errors of simulations on logs")
-        return score_of(self.net, Dataset.sample(self.system, n, seed))
+        wide = self.widened
+        return score_of(wide.net, Dataset.sample(wide.system, n, seed))
 
-    def refine(self, states: ArrayLike, controls: ArrayLike, *, spread: float = 0.05, share: float = 0.7, seed: int = 0,
-               settings: Settings | None = None, progress: bool = True) -> LearnedDynamics:
+    def refine(self, states: ArrayLike, controls: ArrayLike, *, p: Any = None, spread: float = 0.05,
+               share: float = 0.7, seed: int = 0, settings: Settings | None = None,
+               progress: bool = True) -> LearnedDynamics:
         """More training where solutions go: `share` of the samples near rows (states [N, nx], controls [N, nu]).
 
-        Near: normal noise of `spread` times the width of the box; the other samples fill the box. The networks
-        go on from their weights; the structure stays. Asks the system for labels. Raises ValueError for rows that do
-        not fit, and for a model with nothing to train.
+        p: the parameters at these rows, where the system has some: [np] for all, [N, np], or by name. Near: normal
+        noise of `spread` times the width of the box; the other samples fill the box. The networks go on from their
+        weights; the structure stays. Asks the system for labels. Raises ValueError for rows that do not fit, and for a
+        model with nothing to train.
         """
-        return _refined(self, states, controls, spread, share, seed, settings or Settings(), progress)
+        s, settings = self.system, settings or Settings()
+        if not s.np:
+            return _refined(self, states, controls, spread, share, seed, settings, progress)
+        given = checks.states(controls, s.nu, s.name, "controls")[0]
+        values = parameter_rows(p, s.parameter_names, len(given), f"{s.name}.refine", self.parameters)
+        wide = _refined(self.widened, states, np.hstack([given, values]), spread, share, seed, settings, progress)
+        return wide._of(s, self.parameters)
 
     def save(self, folder: str | Path) -> Path:
         """Write folder/dynamics.safetensors: weights, maps, the system's equations and the card, as data."""
@@ -149,6 +180,8 @@ class LearnedDynamics:
         coverage = None if self.coverage is None else self.coverage.to_data()
         card = {"system": self.system.to_data(), "structure": self.structure, "card": dict(self.card), "parts": parts,
                 "coverage": coverage}
+        if self.parameters is not None:
+            card["parameters"] = sampling.to_data(self.parameters)
         known = {} if self.parts is None else {"linear": self.parts.linear, "exact": self.parts.exact}
         return records.save(folder, KIND, nets={"f": self.net}, functions=known, card=card)
 
@@ -158,11 +191,13 @@ class LearnedDynamics:
         record = records.load(folder, KIND)
         with reading(folder, "a model"):
             system = System.from_data(record.card["system"])
-            parts = _structure_from(record.card["parts"], record.functions, box_of(system))
+            there = record.card.get("parameters")
+            parameters = None if there is None else sampling.from_data(there)
+            parts = _structure_from(record.card["parts"], record.functions, box_of(widened(system, parameters)))
             coverage = record.card.get("coverage")
             card = record.card["card"]
             return LearnedDynamics(system, record.nets["f"].eval(), record.card["structure"], card, parts,
-                                   None if coverage is None else Coverage.from_data(coverage))
+                                   None if coverage is None else Coverage.from_data(coverage), parameters)
 
     def __repr__(self) -> str:
         nets = [net for net in self.net.nets if isinstance(net, MLP)]
@@ -175,8 +210,10 @@ class LearnedDynamics:
 def identify(system: System, *, data: Dataset | Log | None = None, method: str = "default", gradients: bool = True,
              known: Known | None = None, control_affine: bool = False, seed: int = 0,
              settings: Settings | PaperSettings | LogSettings | None = None, progress: bool = True,
-             checkpoint: str | Path | None = None) -> LearnedDynamics:
+             checkpoint: str | Path | None = None, parameters: Distribution | None = None) -> LearnedDynamics:
     """f_theta ~ f on the box X x U, learned from labels of f (values and, with `gradients`, Jacobians) or from logs.
+
+    On a system with parameters it is f_theta(x, u, p), over the box of `parameters` too.
 
     Parameters
     ----------
@@ -196,6 +233,9 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
         Structure first; one plain sine network; the paper's network, loss and optimiser.
     settings : Settings, (method "paper") PaperSettings or (logs) LogSettings
         Budgets and sizes.
+    parameters : Uniform or Gaussian
+        Of the system's parameters [np], in their order: where they are drawn. Data have them as columns after the
+        controls: Dataset.u [N, nu + np], B likewise.
     checkpoint : folder
         Finished networks are kept there, and not trained again when the same call is repeated ("paper", logs: unused;
         the trials of given labels are made again).
@@ -212,10 +252,11 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
         Where the labels speak against what is stated.
     """
     settings = _check_arguments(system, method, gradients, settings, seed, data)
+    plant, system = system, _widened(system, parameters, control_affine)
     stated, start, bar = Stated.of(system, known, control_affine), time.perf_counter(), Progress(system.name, progress)
     if isinstance(data, Log):
         assert isinstance(settings, LogSettings)
-        return _from_log(system, data, stated, settings, seed, bar)
+        return _from_log(system, data, stated, settings, seed, bar)._of(plant, parameters)
     assert not isinstance(settings, LogSettings)
     source = Source.of(system, data, gradients)
     _check_stated(stated, method)
@@ -237,7 +278,26 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
     card = {"method": method, "gradients": source.gradients, "seed": seed, "settings": asdict(settings),
             "labels": source.labels, "seconds": round(time.perf_counter() - start, 3), "torch": torch.__version__}
     card["score"] = _score_text(system, net)
-    return LearnedDynamics(system, net, words, card, parts)
+    return LearnedDynamics(system, net, words, card, parts)._of(plant, parameters)
+
+
+def _widened(system: System, parameters: Distribution | None, control_affine: bool) -> System:
+    """The system that is identified: parameters after the controls; ValueError where their place is not given."""
+    owner, names = f"identify {system.name!r}", ", ".join(system.parameter_names)
+    if not system.np:
+        if parameters is not None:
+            raise ValueError(f"{owner}: got parameters = {parameters!r}, but the system has none: leave it out, or "
+                             "declare them, System(..., p=)")
+        return system
+    if system.uses_time:
+        raise ValueError(f"{owner}: f holds the time; expected f(x, u, p): a network of the time is not learned")
+    if not isinstance(parameters, (Uniform, Gaussian)) or parameters.n != system.np:
+        raise ValueError(f"{owner}: parameters is {checks.shown(parameters)}; expected where {names} lie: "
+                         f"parameters=nocl.Uniform(lb [{system.np}], ub [{system.np}])")
+    if control_affine:
+        raise ValueError(f"{owner}: control_affine is not stated for f(x, u, p); expected labels to show it: leave it "
+                         "out")
+    return widened(system, parameters)
 
 
 def _score_text(system: System, net: FeatureNet) -> str:
@@ -293,7 +353,6 @@ def _check_arguments(system: System, method: str, gradients: bool,
                      settings: Settings | PaperSettings | LogSettings | None, seed: int,
                      data: Dataset | Log | None) -> Settings | PaperSettings | LogSettings:
     checks.instance(System, system, "system", "identify", "of an OCP, pass ocp.system")
-    system.refuse_parameters("identify")
     checks.word(method, RECIPES, "method", "identify")
     checks.whole(seed, "seed", "identify", most=2**62)
     checks.flag(gradients, "gradients", "identify")

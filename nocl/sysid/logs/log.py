@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from nocl import parameters
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.sysid.logs.columns import labels_of, numbers, rows_of, seconds
@@ -54,17 +55,18 @@ class Log:
     """Logged trajectories of a system's states and controls."""
 
     states: tuple[str, ...]
-    controls: tuple[str, ...]
+    controls: tuple[str, ...]  # after them parameters, where the system has some
     runs: tuple[Recording, ...]
     left_out: int = 0  # samples in pieces too short to use
 
     @staticmethod
-    def of(system: System, t: ArrayLike, x: ArrayLike, u: ArrayLike, *, xdot: ArrayLike | None = None,
+    def of(system: System, t: ArrayLike, x: ArrayLike, u: ArrayLike, *, xdot: ArrayLike | None = None, p: Any = None,
            run: ArrayLike | None = None, max_gap: float = 1.5, hold_controls: bool = False) -> Log:
         """The log of arrays t [N], x [N, nx], u [N, nu], xdot [N, nx]; `run` [N] tells recordings apart (default: one).
 
-        t is in seconds, or timestamps. `hold_controls`: a missing control is its run's last one, as in logs that have
-        it only when it changes.
+        p: the parameters, where the system has some: [np] for all samples, [N, np], or by name. t is in seconds, or
+        timestamps. `hold_controls`: a missing control is its run's last one, as in logs that have it only when it
+        changes.
 
         Raises ValueError for wrong shapes, times that do not rise within a run, values that cannot be (far outside the
         system's box, angles in degrees, times in another unit than derivatives), and logs without a usable piece.
@@ -73,23 +75,25 @@ class Log:
         owner = f"log of {system.name!r}"
         times = seconds(t, owner)
         n = len(times)
+        inputs = rows_of(u, n, system.control_names, "u", owner)
+        inputs = np.hstack([inputs, parameters.rows(p, system.parameter_names, n, owner)])
         samples = _Samples(times, rows_of(x, n, system.state_names, "x", owner),
-                           rows_of(u, n, system.control_names, "u", owner),
+                           inputs,
                            None if xdot is None else rows_of(xdot, n, system.state_names, "xdot", owner),
                            labels_of(run, n, owner))
         return _log(system, samples, max_gap, hold_controls, owner)
 
     @staticmethod
     def read(path: str | Path, system: System, *, max_gap: float = 1.5, hold_controls: bool = False) -> Log:
-        """A CSV or Parquet file with the columns `t`, the system's states and controls, and perhaps `run`, `dNAME/dt`.
+        """A CSV or Parquet file with the columns `t`, the system's states, controls and parameters.
 
-        Other columns are left aside. t is in seconds, or timestamps (ISO 8601 in CSV). Parquet takes pyarrow: pip
-        install 'nocl[data]'. ValueError for what is missing, and as in `of`.
+        There may be columns `run` and `dNAME/dt`; others are left aside. t is in seconds, or timestamps (ISO 8601 in
+        CSV). Parquet takes pyarrow: pip install 'nocl[data]'. ValueError for what is missing, and as in `of`.
         """
         checks.instance(System, system, "system", "Log", "of an OCP, pass ocp.system")
-        _check_names(system.state_names, system.control_names)
+        _check_names(system.state_names, system.input_names)
         table = read_table(checks.folder(path, "path", "Log.read"))
-        needed = [TIME, *system.names]
+        needed = [TIME, *system.state_names, *system.input_names]
         missing = [name for name in needed if name not in table]
         if missing:
             raise ValueError(f"{path}: no column {', '.join(missing)} (there: {', '.join(table) or 'none'}); expected "
@@ -101,7 +105,7 @@ class Log:
             raise ValueError(f"{path}: has the derivative(s) {', '.join(there)} only; expected all of "
                              f"{', '.join(rates)}, or none: they are then found by smoothing")
         x, u, xdot = (np.column_stack([numbers(table[name], name, path) for name in names]) if names else None
-                      for names in (system.state_names, system.control_names, there))
+                      for names in (system.state_names, system.input_names, there))
         assert x is not None
         assert u is not None
         times = seconds(table[TIME], str(path))
@@ -142,9 +146,9 @@ class Log:
     def check(self, system: System) -> None:
         """ValueError where the log is of other states and controls than the system's."""
         checks.instance(System, system, "system", "Log.check", "of an OCP, pass ocp.system")
-        if (self.states, self.controls) != (system.state_names, system.control_names):
+        if (self.states, self.controls) != (system.state_names, system.input_names):
             raise ValueError(f"the log has {', '.join(self.states + self.controls)}; {system.name!r} has "
-                             f"{', '.join(system.names)}: read the log for this system")
+                             f"{', '.join(system.state_names + system.input_names)}: read the log for this system")
 
     def __len__(self) -> int:
         return sum(map(len, self.runs))
@@ -202,7 +206,7 @@ def _log(system: System, samples: _Samples, max_gap: float, hold_controls: bool,
     if left_out > n / 2:
         warnings.warn(f"{owner}: {left_out} of {n} samples are left out, in pieces of fewer than {LEAST}: {remedy}",
                       UserWarning, stacklevel=3)
-    log = Log(system.state_names, system.control_names, tuple(pieces), left_out)
+    log = Log(system.state_names, system.input_names, tuple(pieces), left_out)
     if samples.xdot is not None:
         _check_logged_rates(log, system, owner)
     return log
