@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from nocl.comparisons.each import Laws
 from nocl.comparisons.judging import Disturbance, Judgement, Judging, judge
-from nocl.comparisons.methods import MethodRun, Solving, Starts, checked, is_count, rates_of, runs_of
+from nocl.comparisons.methods import MethodRun, Solving, Starts, Value, checked, is_count, rates_of, runs_of
 from nocl.comparisons.report.report import Report
 from nocl.comparisons.report.results import (
     Judged,
@@ -80,7 +79,8 @@ def starts_of(ocp: OCP, n: int, x0: ArrayLike | None, seed: int, p: Any) -> Star
         if not is_count(n):
             raise ValueError(f"n is {checks.shown(n)}; expected a number of initial states >= 1")
         drawn = Starts.drawn(ocp, int(n), seed)
-        return drawn if p is None else Starts(drawn.x, ocp.parameters_of(p, len(drawn), "compare"))
+        owner = f"compare, with n = {n} states drawn (n or x0 has other ones)"
+        return drawn if p is None else Starts(drawn.x, ocp.parameters_of(p, len(drawn), owner))
     rows = checks.states(x0, ocp.system.nx, ocp.system.name)[0].copy()
     if not len(rows):
         raise ValueError("x0 has no rows; expected at least one initial state")
@@ -97,11 +97,7 @@ def _judged(ocp: OCP, run: MethodRun, judgement: Judgement, starts: Starts) -> J
 
 def _value(ocp: OCP, method: Any, predicted: Array) -> Any:
     """The method's own value function, which the report draws slices of, where it answers."""
-    return partial(_value_at, ocp, method) if hasattr(method, "value") and np.isfinite(predicted).any() else None
-
-
-def _value_at(ocp: OCP, method: Any, x: Array, t: float, p: Array) -> Any:
-    return method.value(x, t, *Starts(x, p).given(ocp, method))
+    return Value(ocp, method) if hasattr(method, "value") and np.isfinite(predicted).any() else None
 
 
 def _predicted(ocp: OCP, method: Any, starts: Starts) -> Array:

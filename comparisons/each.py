@@ -35,9 +35,12 @@ def at_each(ocp: OCP, make: Make) -> Any:
     if not ocp.np:
         return make(ocp)
     first = make(ocp.folded(ocp.nominal))
+    if isinstance(first, Solution) or not (callable(first) or hasattr(first, "solve") or hasattr(first, "to_casadi")):
+        raise ValueError(f"at_each: make returned a {type(first).__name__}; expected feedback, or a solver, like "
+                         "lambda one: DDP(one)")
     if is_plan(first):
         return Plans(ocp, make, getattr(first, "settled", first))
-    return Laws(ocp, make, policy_function(ocp.folded(ocp.nominal), first) is not None)
+    return Laws(ocp, make, policy_function(ocp.folded(ocp.nominal), first) is not None, getattr(first, "hold", None))
 
 
 def is_plan(method: Any) -> bool:
@@ -79,9 +82,23 @@ class _Each:
 class Laws(_Each):
     """Feedback of each p: rows x [B, nx], p [B, np] -> u [B, nu]. The judge runs each as what it is, continuous too."""
 
-    def __init__(self, ocp: OCP, make: Make, continuous: bool) -> None:
+    def __init__(self, ocp: OCP, make: Make, continuous: bool, hold: int | None = None) -> None:
         super().__init__(ocp, make)
-        self.continuous = continuous
+        self.continuous, self.hold = continuous, hold
+
+    @property
+    def identity(self) -> list[Any]:
+        """What its outcomes depend on: what is made at the nominal parameters and at the corners of their box."""
+        low, high = self.ocp.parameter_box
+        return [getattr(self.make, "__qualname__", type(self.make).__qualname__),
+                *(self._identity(p) for p in (self.ocp.nominal, low, high))]
+
+    def _identity(self, p: Array) -> Any:
+        try:
+            controller = self.at(p)[2]
+        except Exception as error:  # no law there
+            return str(error)
+        return controller if isinstance(controller, ca.Function) else type(controller).__qualname__
 
     def __call__(self, x: Array, t: float, p: Array) -> Array:
         return np.vstack([self._answer(one, x[i], t) for i, one in enumerate(p)])
@@ -97,7 +114,7 @@ class Laws(_Each):
         return np.atleast_2d(answer_of(controller, x[None], t))
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Laws, (self.ocp, self.make, self.continuous)  # what was made is made again
+        return Laws, (self.ocp, self.make, self.continuous, self.hold)  # what was made is made again
 
 
 class Plans(_Each):

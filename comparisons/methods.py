@@ -62,6 +62,8 @@ class MethodRun:
             what = f"{self.controller.nmpc.key} {self.controller.receding}"
         elif isinstance(self.controller, np.ndarray):
             what = self.controller
+        elif isinstance(self.controller, Laws):
+            what = self.controller.identity
         else:
             what = getattr(self.controller, "__qualname__", type(self.controller).__qualname__)
         return [self.name, self.hold, what]
@@ -136,6 +138,21 @@ class Starts:
         return [self.p] if takes_p(ocp, method) else []
 
 
+@dataclass(frozen=True, eq=False)
+class Value:
+    """A method's own value function V(x, t), at the parameters of each state where it is one of them."""
+
+    ocp: OCP
+    method: Any
+
+    @property
+    def takes_p(self) -> bool:
+        return takes_p(self.ocp, self.method)
+
+    def __call__(self, x: Array, t: float, p: Array) -> Any:
+        return self.method.value(x, t, *Starts(x, p).given(self.ocp, self.method))
+
+
 def runs_of(ocp: OCP, methods: Mapping[str, Any], x0: Starts, rates: Rates, solving: Solving) -> list[MethodRun]:
     """The runs of all methods, in order; ValueError for what is no method, before anything is solved."""
     for name, method in methods.items():
@@ -161,7 +178,7 @@ def _check_called(ocp: OCP, name: str, method: Any) -> None:
                          "casadi.Function (x, t) -> u, a solver with solve(x0), a Solution, or a callable (x, t) -> u")
     if not is_plan(method):
         _named(name, check_takes_p, ocp, method)
-    elif takes_p(ocp, method) and "p" not in inspect.signature(method.solve).parameters:
+    elif takes_p(ocp, method) and not _accepts(method.solve, "p"):
         raise ValueError(f"method {name!r} is a {type(method).__name__}, whose solve takes no p, and the problem has "
                          f"the parameters {', '.join(ocp.parameter_names)}; expected solve(x0, p=): let it be made "
                          "anew at each p, nocl.comparisons.at_each(ocp, make)")
@@ -245,7 +262,9 @@ def _check_solution(ocp: OCP, name: str, solution: Solution, starts: Starts) -> 
         raise ValueError(f"method {name!r} solves state {away[0]} from {solution.x[away[0], 0].tolist()}, but the "
                          f"comparison starts it at {x0[away[0]].tolist()}: pass the Solution's x0 to compare")
     low, high = ocp.parameter_box
-    if solution.p is not None and not np.allclose(solution.p, starts.p, rtol=0, atol=SAME_STATE * (high - low)):
+    near = SAME_STATE * (np.abs(starts.p) + high - low)
+    if solution.p is not None and not (solution.p.shape == starts.p.shape
+                                       and (np.abs(solution.p - starts.p) <= near).all()):
         raise ValueError(f"method {name!r} solves other parameters than those of the comparison: pass the Solution's "
                          "x0 and p to compare")
     if wrong := _off_grid(ocp, solution):
@@ -268,8 +287,7 @@ def solve(ocp: OCP, solver: Any, name: str, x0: Starts, solving: Solving) -> lis
     given: dict[str, Any] = {"workers": solving.workers, "out": out, "progress": solving.progress}
     if takes_p(ocp, solver):
         given["p"] = x0.p
-    takes = inspect.signature(solver.solve).parameters
-    options = {key: value for key, value in given.items() if key in takes}
+    options = {key: value for key, value in given.items() if _accepts(solver.solve, key)}
     try:
         solution = solver.solve(x0.x, **options)
     except Exception as error:  # a solver may raise anything: it becomes a row
@@ -278,6 +296,12 @@ def solve(ocp: OCP, solver: Any, name: str, x0: Starts, solving: Solving) -> lis
         alone = Solving(1, None, solving.progress)
         return [solve(ocp, solver, name, x0[[i]], alone)[0] for i in range(len(x0))]
     return [solution]
+
+
+def _accepts(function: Callable[..., Any], name: str) -> bool:
+    """Whether it takes a keyword of that name."""
+    takes = inspect.signature(function).parameters
+    return name in takes or any(one.kind is one.VAR_KEYWORD for one in takes.values())
 
 
 def planned(ocp: OCP, name: str, method: Any, parts: Sequence[Solution | str], B: int) -> MethodRun:
@@ -291,6 +315,10 @@ def planned(ocp: OCP, name: str, method: Any, parts: Sequence[Solution | str], B
         i = len(message)
         if isinstance(s, str):
             message.append(s)
+            continue
+        if s.u.shape[1] != K:
+            why = f"its plan has {s.u.shape[1]} intervals, those of other parameters {K}: plan on as many"
+            message += [why] * len(s)
             continue
         rows = slice(i, i + len(s.u))
         u[rows], predicted[rows], plan.x[rows] = s.u, s.cost, s.x

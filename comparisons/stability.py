@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from scipy.integrate import solve_ivp
 
-from nocl.comparisons.each import Laws
+from nocl.comparisons.each import Laws, at_each
 from nocl.comparisons.methods import Starts
 from nocl.comparisons.report.findings import Stability
 from nocl.comparisons.report.report import Report
@@ -45,15 +45,40 @@ def stability(report: Report, methods: Mapping[str, Any]) -> tuple[Stability, ..
     that are made for each p are made anew, and trajectories have their own.
     """
     ocp = report.ocp
-    policies = {name: policy for name, method in methods.items() if not isinstance(method, Laws)
-                and (policy := policy_function(ocp, method)) is not None}
-    if "LQR" not in policies:
-        policies |= _lqr(ocp)
+    laws = {name: law for name, method in methods.items() if (law := _law(ocp, method)) is not None}
+    if "LQR" not in methods:
+        laws |= _lqr(ocp)
     goal, middle = Starts(ocp.x_goal[None], ocp.nominal[None]), _middle(report)
     places = [("goal", LATE * ocp.horizon, goal), ("mid-horizon", MIDDLE * ocp.horizon, middle)]
-    found = [local(ocp, name, policy, where, t, at.x, at.p) for where, t, at in places if len(at)
-             for name, policy in policies.items() if where == "goal" or not (name == "LQR" and ocp.np)]
+    found = [_near(ocp, name, law, where, t, at) for where, t, at in places if len(at) for name, law in laws.items()]
     return tuple([s for s in found if s is not None] + _optimum(report))
+
+
+def _law(ocp: OCP, method: Any) -> Laws | ca.Function | None:
+    """What is looked at of a method: its policy, or those that are made at each p."""
+    return method if isinstance(method, Laws) else policy_function(ocp, method)
+
+
+def _near(ocp: OCP, name: str, law: Laws | ca.Function, where: str, t: float, at: Starts) -> Stability | None:
+    """A law at points and their parameters; one that is made at each p is made at theirs."""
+    if not isinstance(law, Laws):
+        return local(ocp, name, law, where, t, at.x, at.p)
+    parts = [part for x, p in zip(at.x, at.p, strict=True) if (part := _made(law, name, where, t, x, p)) is not None]
+    if not parts:
+        return None
+    eigenvalues, gain, growth = (np.concatenate([getattr(part, field) for part in parts])
+                                 for field in ("eigenvalues", "gain", "growth"))
+    return Stability(name, where, t, eigenvalues, gain, growth)
+
+
+def _made(laws: Laws, name: str, where: str, t: float, x: Array, p: Array) -> Stability | None:
+    try:
+        one, _, policy = laws.at(p)
+    except Exception:  # none can be made there: the judge's row says why
+        return None
+    if not isinstance(policy, ca.Function):
+        return None
+    return local(one, name, policy, where, t, x[None], np.zeros((1, 0)))
 
 
 def local(ocp: OCP, name: str, policy: ca.Function, where: str, t: float, x: Array, p: Array) -> Stability | None:
@@ -92,10 +117,10 @@ def _eigenvalues(A: Array) -> Any:
     return np.take_along_axis(values, np.argsort(-values.real, axis=1), axis=1)
 
 
-def _lqr(ocp: OCP) -> dict[str, ca.Function]:
-    """LQR about the goal, that of the nominal parameters."""
+def _lqr(ocp: OCP) -> dict[str, Laws | ca.Function]:
+    """LQR about the goal, that of each p."""
     try:
-        law = policy_function(ocp, LQR(ocp.folded(ocp.nominal)))
+        law = _law(ocp, at_each(ocp, LQR))
     except ValueError:  # the goal pair is no equilibrium, L not convex there, or it holds the time
         return {}
     return {} if law is None else {"LQR": law}

@@ -299,8 +299,10 @@ class OCP:
 
     def unit(self, name: str) -> str:
         """The unit of a state, control or parameter for an axis label, like 'goal [m]'."""
+        if name not in known.names_of(self.p):
+            return self.system.unit(name)
         unit = known.units_of(self.p).get(name)
-        return f"{name} [{unit}]" if unit else self.system.unit(name)
+        return f"{name} [{unit}]" if unit else name
 
     def parameters_of(self, p: Any, B: int, owner: str) -> Array:
         """A user's parameters as rows [B, np]: p is [np] for all, [B, np], or a dict from names to numbers or [B].

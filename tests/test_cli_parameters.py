@@ -57,11 +57,21 @@ def test_each_state_is_solved_at_its_own_p(here, capsys, solver):
 def test_with_p_the_problem_is_that_at_p(here, capsys):
     line = ["solve", "mover.py", "--solver", "lqr", "--n", "2", "--out", "new", "--p", "goal=0.5, mass=1.2"]
     assert main(line) == 0
-    assert "its own" not in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "its own" not in said
+    assert "drawn with seed 1, at goal = 0.5, mass = 1.2" in said
     facts, data = solved(here / "new", "lqr")
     assert facts["p"] == {"mass": 1.2, "goal": 0.5}
     assert "p" not in data
     np.testing.assert_allclose(data["cost"], optimum(data["x0"], np.array([[1.2, 0.5]] * 2)), rtol=1e-7)
+
+
+def test_dynamics_are_learned_over_the_plants_parameters(here, capsys):
+    assert main(["identify", "mover.py", "--quick", "--out", "new"]) == 0
+    model = nocl.LearnedDynamics.load(here / "new" / "dynamics")
+    assert model.to_casadi().name_in() == ["x", "u", "p"]
+    np.testing.assert_array_equal(model.parameters.ub, [1.2])
+    assert model.score().mean < 0.01
 
 
 @pytest.mark.slow
@@ -73,6 +83,8 @@ def test_a_controller_of_p_is_compared_and_exported(here, capsys):
     assert {"p_mass", "p_goal"} < set(head.split(","))
     assert len(rows) == 3 * 2  # with the reference
     assert main(["compare", "law", "--methods", "cnd,lqr", "--n", "2", "--out", "at", "--p", "mass=0.9,goal=0.5"]) == 0
+    assert capsys.readouterr().out.count("at mass = 0.9, goal = 0.5") == 2
+    assert "mass = 0.9, goal = 0.5" in (here / "at" / "summary.json").read_text()
     assert "p_mass" not in (here / "at" / "rows.csv").read_text()
     summary = json.loads((here / "at" / "summary.json").read_text())["summary"]
     one = law_of_mass().ocp.at([0.9, 0.5])
@@ -92,9 +104,7 @@ def test_a_controller_of_p_is_compared_and_exported(here, capsys):
     ("solve mover.py --p mass=1,goal=0,size=3", "unknown size"),
     ("solve cartpole --p mass=1", "the problem has no parameters"),
     ("solve mover.py --solver neural-oc", "is made for one p, and the problem on 'mover' has the"),
-    ("train mover.py", "learned dynamics are not implemented for parameters"),
-    ("identify mover.py", "give --p mass=1,goal=0, or train on the equations, --exact"),
-    ("run mover.py", "the system 'mover' has mass")])
+    ("solve mover.py --solver level-sets", "is made for one p, and the problem on 'mover' has the")])
 def test_mistakes_are_one_line_and_nothing_is_written(here, capsys, line, said):
     assert main([*line.split(), "--out", "new"]) == 2
     err = capsys.readouterr().err

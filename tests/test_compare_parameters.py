@@ -110,6 +110,12 @@ def test_the_page_knows_each_goal_and_p(ocp, report):
     goals = np.frombuffer(b64decode(data["goals"]), "<f4").reshape(N, 3)
     np.testing.assert_allclose(goals[:, 0], report.p[:, 1], rtol=1e-6)
     assert not goals[:, 1:].any()
+    assert data["slices"]["p"] == ocp.nominal.tolist()
+    shared = compare(ocp, {"CND": law_of_mass()}, n=2, p=[1.1, 0.4], progress=False)
+    assert payload(shared)["slices"]["p"] == [1.1, 0.4]
+    assert payload(shared)["slices"]["goal"] == [0.4, 0]
+    fixed = compare(ocp, {"at": law_of_mass().at([1.1, 0.4])}, n=2, progress=False)
+    assert "p" not in payload(fixed)["slices"]
     plain = ocp.at([1.0, 0.5])
     assert "p" not in payload(compare(plain, {"LQR": LQR(plain)}, n=2, progress=False))
 
@@ -151,6 +157,14 @@ def test_states_without_parameters_are_refused(ocp):
         compare(ocp, {"by hand": proportional}, x0=[0.0, 0.0], progress=False)
     with pytest.raises(ValueError, match="make is 3; expected a function"):
         at_each(ocp, 3)
+    for made, kind in ((3, "int"), (DDP(ocp, intervals=10).solve([0, 0], p=[1, 0]), "Solution")):
+        with pytest.raises(ValueError, match=f"make returned a {kind}; expected feedback, or a solver"):
+            at_each(ocp, lambda one, made=made: made)
+    with pytest.raises(ValueError, match=r"with n = 100 states drawn .*p has shape \(2, 2\)"):
+        compare(ocp, {"by hand": proportional}, p=[[1, 0], [1, 0.1]], progress=False)
+    solution = DDP(ocp, intervals=10).solve([0, 0], p=[1, 0])
+    with pytest.raises(ValueError, match="solves other parameters than those of the comparison"):
+        compare(ocp.at([1, 0]), {"s": solution}, x0=[0, 0], progress=False)
 
 
 def test_a_solver_made_at_each_p_solves_that_problem(ocp):
@@ -173,6 +187,40 @@ def test_a_failure_at_one_p_is_a_row(ocp):
     assert of(report, "some").message[1] == "ValueError: not to the right"
 
 
+def test_plans_on_other_grids_are_rows_that_say_so(ocp):
+    report = compare(ocp, {"DDP": at_each(ocp, lambda one: DDP(one, intervals=10 if one.x_goal[0] < 0 else 20))},
+                     x0=np.zeros((2, 2)), p=[[1, -0.5], [1, 0.5]], progress=False)
+    assert of(report, "DDP").success.tolist() == [False, True]
+    assert "its plan has 10 intervals, those of other parameters 20" in of(report, "DDP").message[0]
+
+
+def test_a_solver_with_any_keyword_gets_p(ocp):
+    class Any:
+        def solve(self, x0, **given):
+            return DDP(ocp, intervals=10).solve(x0, p=given["p"])
+
+    report = compare(ocp, {"any": Any(), "DDP": DDP(ocp, intervals=10)}, n=2, progress=False)
+    np.testing.assert_array_equal(report.cost[0], report.cost[1])
+
+
+def test_feedback_made_at_each_p_keeps_its_own_rate(ocp):
+    def make(one):
+        return NMPC(one, 10, starts=1, passes=0).controller()
+
+    report = compare(ocp, {"each": at_each(ocp, make), "rows": make(ocp)}, n=1, progress=False)
+    assert report.cost[0] == pytest.approx(report.cost[1], rel=1e-6)
+
+
+def test_parameters_without_units_have_a_report(tmp_path):
+    x, u, goal = ca.SX.sym("x"), ca.SX.sym("u"), nocl.parameter("goal")
+    s = nocl.System("line", x=x, u=u, xdot=u, lbu=[-1], ubu=[1], lbx=[-4], ubx=[4])
+    ocp = nocl.OCP(s, p=goal, horizon=1.0, running=u**2, terminal=(x - goal)**2, x_goal=[goal], u_goal=[0],
+                   initial_states=nocl.Gaussian([0], [0.1]), parameters=nocl.Uniform([-1], [1]))
+    assert ocp.unit("goal") == "goal"
+    path = compare(ocp, {"LQR": at_each(ocp, LQR)}, n=2, progress=False).save(tmp_path / "report", animation=False)
+    assert '"plabels":["goal"]' in (path if path.is_file() else path / "report.html").read_text()
+
+
 def test_nmpc_as_feedback_has_each_p(ocp):
     loop = NMPC(ocp, 10, starts=1, passes=0).controller()
     x0, p = np.array([[0.3, -0.2], [0.1, 0.0]]), np.array([[0.9, 0.5], [1.1, -0.5]])
@@ -191,6 +239,16 @@ def test_processes_and_a_folder_find_the_same(ocp, tmp_path):
         compare(ocp, methods, n=3, out=tmp_path, progress=False, p=[1.0, 0.0])
 
 
+def test_a_folder_knows_what_is_made_at_each_p(ocp, tmp_path):
+    def weak(one):
+        law = LQR(one).to_casadi()
+        return ca.Function("weak", law.mx_in(), [0.5 * law(*law.mx_in())], law.name_in(), law.name_out())
+
+    compare(ocp, {"LQR": at_each(ocp, LQR)}, n=2, out=tmp_path, progress=False)
+    with pytest.raises(ValueError, match="another run"):
+        compare(ocp, {"LQR": at_each(ocp, weak)}, n=2, out=tmp_path, progress=False)
+
+
 def test_a_study_holds_audits_and_stability_at_each_p(ocp):
     report = study(ocp, {"P": function_of_p(), "LQR": at_each(ocp, LQR), "CND": law_of_mass()}, n=3, workers=1,
                    progress=False)
@@ -205,6 +263,13 @@ def test_a_study_holds_audits_and_stability_at_each_p(ocp):
     np.testing.assert_allclose(np.sort_complex(at_goal.eigenvalues[0]), np.sort_complex(expected), rtol=1e-9)
     middle = next(s for s in report.stability if (s.method, s.where) == ("P", "mid-horizon"))
     np.testing.assert_allclose(middle.gain[:, 0], -3 * report.p[:, :1] * [1, 1], rtol=1e-9)  # each its own mass
+    for method, place in (("LQR", "goal"), ("LQR", "mid-horizon")):  # made at each p, at mid-horizon too
+        own = next(s for s in report.stability if (s.method, s.where) == (method, place))
+        p = ocp.nominal[None] if place == "goal" else report.p
+        laws = [LQR(ocp.at(row)).to_casadi() for row in p]
+        gains = [ca.Function("K", law.mx_in(), [ca.jacobian(law(*law.mx_in()), law.mx_in()[0])])(
+            [*(row[1:] if place == "goal" else [0.1]), 0], own.t).full()[0] for law, row in zip(laws, p, strict=True)]
+        np.testing.assert_allclose(own.gain[:, 0], gains, rtol=1e-9)
     assert len(report.promises) == 3
     assert "of the initial states and parameters of these distributions end within 2 %" in str(report.promises[0])
     with pytest.raises(ValueError, match=r"study\(robust=True\) is not implemented for the parameter"):

@@ -225,9 +225,10 @@ def obstacles(report: Results) -> list[dict[str, Any]]:
 
 
 def slices(report: Results) -> dict[str, Any] | None:
-    """V over pairs of coordinates at some times, the others as in the median run, at the nominal parameters.
+    """V over pairs of coordinates at some times, the others as in the median run; None without a value function.
 
-    None without a value function.
+    On a problem with parameters: at those of all states where they share them, else at the nominal ones; a V that was
+    made for one p is that.
     """
     owner = valued(report)
     if owner is None:
@@ -243,12 +244,15 @@ def slices(report: Results) -> dict[str, Any] | None:
     if not pairs or not ok.any():
         return None
     base = [np.median(s.x[ok, k], axis=0) for k in nodes]
-    p = report.ocp.nominal
+    ocp, given = report.ocp, report.parameters
+    p = given[0] if len(given) and (given == given[0]).all() else ocp.nominal
+    takes_p = getattr(owner.value, "takes_p", False)
+    of_p = {"p": p.tolist(), "goal": ocp.goals(p[None])[0][0].tolist()} if takes_p else {}
     V = [[_slice(owner, b, pair, low, high, float(s.t[k]), p) for b, k in zip(base, nodes, strict=True)]
          for pair in pairs]
     return {"method": owner.name, "pairs": [[int(k) for k in pair] for pair in pairs],
             "t": [float(s.t[k]) for k in nodes], "n": GRID, "base": np.array(base).tolist(), "low": low.tolist(),
-            "high": high.tolist(), "V": floats(np.array(V))}
+            "high": high.tolist(), "V": floats(np.array(V)), **of_p}
 
 
 def _slice(owner: Judged, base: Array, pair: tuple[int, ...], low: Array, high: Array, t: float, p: Array) -> Array:

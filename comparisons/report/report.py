@@ -40,7 +40,8 @@ class Report(Results):
         return write_report(self, Path(folder), animation, draw)
 
     def __str__(self) -> str:
-        each = f", each at its own {', '.join(self.ocp.parameter_names)}" if self.ocp.np else ""
+        own, fixed = ", ".join(self.ocp.parameter_names), self.settings.get("parameters", "")
+        each = f", each at its own {own}" if own else f", at {fixed}" if fixed else ""
         what = f"{self.ocp.system.name}, {count(len(self.x0), 'initial state')} {self.settings['initial states']}{each}"
         said = [textwrap.fill(sentence, WIDTH, subsequent_indent="  ") for sentence in self.verdict()]
         promised = [textwrap.fill(str(promise), WIDTH, subsequent_indent="  ") for promise in self.promises]

@@ -140,10 +140,11 @@ class RunFolder:
     def compare(self, cnd: CND, out: Path, methods: Sequence[str], n: int, intervals: int,
                 hold: Sequence[int | None] | None = None, robust: bool = False) -> None:
         """Study the methods on n fresh initial states, save the report and print its summary and verdict."""
+        at = cnd.card.get("p")  # those that it was folded at
         entries, options = [registry.METHODS[name] for name in methods], registry.Options(intervals, self.seed)
         titles = ", ".join(entry.title for entry in entries)
-        say(f"comparing {titles} on {n} initial states, drawn with seed {fresh_seed(self.seed)}{own_p(self.ocp)}, on "
-            "the exact dynamics")
+        say(f"comparing {titles} on {n} initial states, drawn with seed {fresh_seed(self.seed)}{own_p(self.ocp, at)}, "
+            "on the exact dynamics")
         chosen = {entry.title: built(self.ocp, entry, options) if entry.make else cnd for entry in entries}
         model = self._dynamics_there() if cnd.card.get("dynamics") == "learned" else None
         checkpoint = self._checkpoint(
@@ -151,6 +152,8 @@ class RunFolder:
             controller=fingerprint(cnd.to_casadi()))
         report = study(self.ocp, chosen, n=n, seed=fresh_seed(self.seed), hold=hold, model=model, robust=robust,
                        variants=mass_variants(self.ocp) if robust else None, out=checkpoint)
+        if at:
+            report = replace(report, settings={**report.settings, "parameters": p_text(at)})
         path = report.save(out)
         _forget(checkpoint)
         say(f"\n{report}\n\nreport: {path}")
@@ -224,9 +227,14 @@ def fresh_states(ocp: OCP, n: int, seed: int) -> np.ndarray[Any, np.dtype[np.flo
     return ocp.initial_states.sample(n, fresh_seed(seed))
 
 
-def own_p(ocp: OCP) -> str:
-    """That each state has its own parameters, in words; "" where there are none."""
-    return f", each at its own {', '.join(ocp.parameter_names)}" if ocp.np else ""
+def own_p(ocp: OCP, at: Mapping[str, float] | None = None) -> str:
+    """That each state has its own parameters, or all have those of `at`, in words; "" where there are none."""
+    return f", at {p_text(at)}" if at else f", each at its own {', '.join(ocp.parameter_names)}" if ocp.np else ""
+
+
+def p_text(p: Mapping[str, float]) -> str:
+    """Parameters as they are typed, "mass = 1.2, goal = 0.5"."""
+    return ", ".join(f"{name} = {value:g}" for name, value in p.items())
 
 
 def built(ocp: OCP, entry: registry.Method, options: registry.Options) -> Any:
@@ -271,7 +279,7 @@ def solve(ocp: OCP, out: Path, name: str, n: int, options: registry.Options, wor
     ok = arrays["success"]
     mean = f", mean cost {arrays['cost'][ok].mean():.4g}" if ok.any() else ""
     say(f"{name}: {ok.sum()} of {n} {'solved' if planned else 'simulated'}{mean}, {time.perf_counter() - start:.1f} s; "
-        f"drawn with seed {fresh_seed(seed)}{own_p(ocp)}\n{_verdict(ocp, arrays, judged, s.message)}{path}")
+        f"drawn with seed {fresh_seed(seed)}{own_p(ocp, at)}\n{_verdict(ocp, arrays, judged, s.message)}{path}")
     if not ok.any():
         raise ValueError(f"{name} {'solved' if planned else 'simulated'} none of {count(n, 'initial state')}; of the "
                          f"first: {s.message[0]}")

@@ -139,7 +139,11 @@ def _check(function: ca.Function, rows: nn.Module, sizes: Sequence[int]) -> None
     with torch.no_grad():
         expected = np.vstack([rows(torch.from_numpy(row[None])).numpy() for row in z])
     got = np.vstack([function.call(list(np.split(row, np.cumsum(sizes)[:-1])))[0].full().ravel() for row in z])
-    error = np.abs(got - expected).max() / (1 + np.abs(expected).max())
+    finite = np.isfinite(expected)
+    if not (np.isfinite(got) == finite).all() or not finite.any():
+        raise ValueError("to_casadi: what L4CasADi compiled, or the module, is NaN or inf where the other is not, or "
+                         "everywhere, at points of [-1, 1]: expected a module that is finite there")
+    error = np.abs(got - expected)[finite].max() / (1 + np.abs(expected[finite]).max())
     if not error <= TOLERANCE:
         raise ValueError(f"to_casadi: what L4CasADi compiled differs from the module by {error:.2g}, expected at most "
                          f"{TOLERANCE:g}: check that no branch of the module depends on values")

@@ -278,10 +278,11 @@ function drawSlice() {
     traces.push({type: "scatter", mode: "markers", x: dots[0], y: dots[1], name: MNAMES[m], legendgroup: String(m), showlegend: false, hoverinfo: "skip",
                  marker: {color: colour(m), size: 5, line: {width: 0.5, color: css("--back")}}});
   });
-  traces.push({type: "scatter", mode: "markers", x: [D.goal[i]], y: [D.goal[k]], showlegend: false, hoverinfo: "skip", marker: {symbol: "star", size: 12, color: css("--text")}});
+  const star = S.goal || (np ? null : D.goal);
+  if (star) traces.push({type: "scatter", mode: "markers", x: [star[i]], y: [star[k]], showlegend: false, hoverinfo: "skip", marker: {symbol: "star", size: 12, color: css("--text")}});
   const rest = D.states.map((name, c) => [name, S.base[q][c], c]).filter(([, , c]) => c !== i && c !== k).map(([name, v]) => `${name} = ${text(v)}`).join(", ");
   $("slicenote").textContent = `V(x, t) of ${S.method} at t = ${text(t)}` + (rest ? `, with ${rest} (the median of its runs then)` : "") +
-    (np ? `, at the nominal ${PARAMETERS.map((name, c) => `${name} = ${text(D.nominal[c])}`).join(", ")}` : "") +
+    (S.p ? `, at ${PARAMETERS.map((name, c) => `${name} = ${text(S.p[c])}`).join(", ")}` : np ? ", of the one p that it was made for" : "") +
     `. On top: ${some.length} runs of each method; dots: where they are at that time. Where others than these two coordinates matter, a run does not lie in the slice.`;
   draw("slice", traces, {xaxis: axis({title: {text: LABELS[i]}, range: [S.low[i], S.high[i]]}), yaxis: axis({title: {text: LABELS[k]}, range: [S.low[k], S.high[k]]})});
 }
