@@ -177,3 +177,94 @@ def test_missing_packages_say_how_to_install_them(ocp, monkeypatch):
                         (nocl.to_acados, ocp.system)):
         with pytest.raises(ValueError, match="pip install"):
             call(thing)
+
+
+@pytest.fixture(scope="module")
+def varied():
+    """Two masses to a moving goal, with drag that fades: f in t and p, L in t and p, a constraint in p."""
+    x, u, t = ca.vertcat(ca.SX.sym("pos"), ca.SX.sym("v")), ca.SX.sym("u"), nocl.time()
+    mass, goal = nocl.parameter("mass", 1.0, "kg"), nocl.parameter("goal", 0.5)
+    s = nocl.System("varied", x=x, u=u, p=mass, xdot=ca.vertcat(x[1], u / mass - ca.exp(-t) * x[1]), lbu=[-2], ubu=[2],
+                    lbx=[-4, -4], ubx=[4, 4])
+    return nocl.OCP(s, p=goal, horizon=2.0, running=0.1 * u**2 + (x[0] - goal * ca.sin(t))**2, terminal=mass * x[1]**2,
+                    x_goal=[goal, 0], u_goal=[0], initial_states=nocl.Gaussian([0, 0], [0.3, 0.3]),
+                    parameters=nocl.Uniform([0.5, -1], [2, 1]), path_constraints={"wall": goal + 2 - x[0]})
+
+
+@pytest.mark.parametrize("integrator", ["rk4", "cvodes"])
+def test_each_episode_has_its_own_parameters(varied, integrator):
+    pytest.importorskip("gymnasium")
+    from gymnasium.utils.env_checker import check_env
+
+    env = nocl.to_gymnasium(varied, steps=40, integrator=integrator)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*(infinity|symmetric and normalized|spec).*")
+        check_env(env, skip_render_check=True)
+    seen = np.array([env.reset(seed=i)[0] for i in range(200)])
+    assert seen.shape == (200, 5)
+    low, high = varied.parameter_box
+    assert ((low <= seen[:, 3:]) & (seen[:, 3:] <= high)).all()
+    assert np.abs(np.corrcoef(seen[:, [0, 1, 3, 4]].T)[:2, 2:]).max() < 0.3  # p is drawn apart from x0
+    x0, p, u = np.array([0.2, -0.1]), {"mass": 1.5, "goal": 0.8}, np.random.default_rng(0).uniform(-2, 2, (40, 1))
+    observation, info = env.reset(options={"x0": x0, "p": p})
+    np.testing.assert_array_equal(observation, [*x0, 0, 1.5, 0.8])
+    assert info["clearance"] == pytest.approx(2.6)
+    total = sum(env.step(held)[1] for held in u)
+    run = nocl.simulate(varied, u[None], x0, p=p)
+    assert -total == pytest.approx(run.cost[0], rel=1e-4 if integrator == "rk4" else 1e-7)
+    with pytest.raises(ValueError, match="p lacks goal"):
+        env.reset(options={"p": {"mass": 1.0}})
+
+
+def test_control_has_parameters_and_time(varied):
+    control, s = pytest.importorskip("control"), varied.system
+    plant, x, u = nocl.to_control(s), np.array([0.2, -0.1]), np.array([0.5])
+    for t, mass in ((0.0, 1.0), (0.7, 1.8)):
+        rate = s.f(x, u, t, mass).full().ravel()
+        np.testing.assert_allclose(plant.dynamics(t, x, u, params={"mass": mass}), rate, rtol=1e-14)
+    np.testing.assert_allclose(plant.dynamics(0.0, x, u), s.f(x, u, 0.0, 1.0).full().ravel(), rtol=1e-14)
+    A, B = s.linearize(x, u, 0.7, [1.8])
+    linear = nocl.to_control(s, x, u, t=0.7, p=[1.8])
+    np.testing.assert_array_equal(np.hstack([linear.A, linear.B]), np.hstack([A, B]))
+    times, inputs = nocl.held_inputs(np.linspace(0, 2, 41), np.full((40, 1), 0.5))
+    response = control.input_output_response(plant, times, inputs, x, params={"mass": 1.8},
+                                             solve_ivp_kwargs={"max_step": 0.05, "rtol": 1e-9})
+    run = nocl.simulate(varied, np.full((1, 40, 1), 0.5), x, p=[1.8, 0.0])
+    np.testing.assert_allclose(response.states[:, -1], run.x[0, -1], rtol=1e-6)
+
+
+def test_acados_has_parameters_and_time(varied, monkeypatch):
+    class AcadosModel:
+        pass
+
+    monkeypatch.setitem(sys.modules, "acados_template", SimpleNamespace(AcadosModel=AcadosModel))
+    model, f = nocl.to_acados(varied.system), varied.system.f
+    equations = ca.Function("equations", [model.x, model.u, model.t, model.p], [model.f_expl_expr])
+    at = (np.array([0.1, 0.2]), 0.5, 0.7, 1.8)
+    np.testing.assert_allclose(equations(*at).full(), f(*at).full(), rtol=1e-14)
+
+
+def test_do_mpc_has_parameters_and_no_time(varied, monkeypatch):
+    class Model:
+        def __init__(self, *_):
+            self.made, self.rates = [], {}
+
+        def set_variable(self, kind, name):
+            self.made.append((kind, ca.SX.sym(name)))
+            return self.made[-1][1]
+
+        def set_rhs(self, name, rate):
+            self.rates[name] = rate
+
+        def setup(self):
+            pass
+
+    monkeypatch.setitem(sys.modules, "do_mpc", SimpleNamespace(model=SimpleNamespace(Model=Model)))
+    with pytest.raises(ValueError, match=r"holds the time; expected f\(x, u, p\)"):
+        nocl.to_do_mpc(varied.system)
+    s = varied.system
+    still = replace(s, xdot=ca.substitute(s.equations, nocl.time(), 0.7))
+    model = nocl.to_do_mpc(still)
+    assert [kind for kind, _ in model.made] == ["_x", "_x", "_u", "_p"]
+    f = ca.Function("f", [symbol for _, symbol in model.made], [ca.vertcat(*model.rates.values())])
+    np.testing.assert_allclose(f(0.1, 0.2, 0.5, 1.8).full(), s.f([0.1, 0.2], 0.5, 0.7, 1.8).full(), rtol=1e-14)

@@ -9,32 +9,38 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from nocl import parameters
 from nocl.ocp import OCP
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.support.packages import package
 from nocl.system import System
 
+Step = Callable[[Array, Array, float, Array], tuple[Array, float]]  # (x, u, t, p) -> (x after it, its cost)
 EDGE = 1e-9  # of an interval: how long a held control takes to become the next
 
 
-def to_control(system: System, x: ArrayLike | None = None, u: ArrayLike | None = None) -> Any:
-    """python-control's NonlinearIOSystem: inputs u (not clipped to U), outputs x; with (x, u) the StateSpace there.
+def to_control(system: System, x: ArrayLike | None = None, u: ArrayLike | None = None, *, t: float = 0.0,
+               p: Any = None) -> Any:
+    """python-control's NonlinearIOSystem: inputs u (not clipped to U), outputs x; with (x, u[, t][, p]) the StateSpace
+    there.
 
-    Held controls, such as NMPC's, go through `held_inputs`.
+    Parameters are its `params`, by name, with their nominal values where they have some. Held controls, such as NMPC's,
+    go through `held_inputs`.
     """
-    system.refuse_parameters("to_control")
     if (x is None) != (u is None):
         raise ValueError(f"to_control({system.name}): got one of x and u; expected both, or neither")
     if x is not None and u is not None:
-        return _statespace(system, x, u)
-    control, f = package("control"), system.f
+        return _statespace(system, x, u, t, p)
+    control, f, names = package("control"), system.f, system.parameter_names
 
     def update(t: float, x: Array, u: Array, params: Any) -> Array:
-        return f(x, u).full().ravel()
+        given = parameters.rows({n: params[n] for n in names if n in params}, names, 1, f"{system.name}: params")
+        return f(*system.arguments.columns(x=x, u=u, t=t, p=given)).full().ravel()
 
+    nominal = {n: value for n, value in zip(names, system.nominal.tolist(), strict=True) if np.isfinite(value)}
     return control.NonlinearIOSystem(update, None, inputs=list(system.control_names), outputs=list(system.state_names),
-                                     states=list(system.state_names), name=system.name)
+                                     states=list(system.state_names), name=system.name, params=nominal)
 
 
 def held_inputs(t: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
@@ -54,36 +60,43 @@ def held_inputs(t: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
     return np.c_[times[:-1], ends].ravel(), np.repeat(controls, 2, axis=0).T
 
 
-def _statespace(system: System, x: ArrayLike, u: ArrayLike) -> Any:
-    """python-control's StateSpace of the linearisation at (x, u): A, B exact, C = I."""
-    A, B = system.linearize(x, u)
+def _statespace(system: System, x: ArrayLike, u: ArrayLike, t: float, p: Any) -> Any:
+    """python-control's StateSpace of the linearisation at (x, u, t, p): A, B exact, C = I."""
+    A, B = system.linearize(x, u, t, p)
     return package("control").StateSpace(A, B, np.eye(system.nx), np.zeros((system.nx, system.nu)),
                                          inputs=list(system.control_names), outputs=list(system.state_names),
                                          states=list(system.state_names), name=system.name)
 
 
 def to_do_mpc(system: System) -> Any:
-    """do-mpc's continuous Model of the system, set up; states and controls under their names."""
-    system.refuse_parameters("to_do_mpc")
+    """do-mpc's continuous Model of the system, set up; states, controls and parameters (_p) under their names.
+
+    Raises ValueError for an f that holds the time: do-mpc's models have none.
+    """
+    if system.uses_time:
+        raise ValueError(f"to_do_mpc: f of {system.name!r} holds the time; expected f(x, u, p): make it a state, with "
+                         "derivative 1")
     model = package("do_mpc", "do-mpc").model.Model("continuous", "SX")
     x = ca.vertcat(*(model.set_variable("_x", n) for n in system.state_names))
     u = ca.vertcat(*(model.set_variable("_u", n) for n in system.control_names))
-    for name, rate in zip(system.state_names, ca.vertsplit(system.f(x, u)), strict=True):
+    p = ca.vertcat(*(model.set_variable("_p", n) for n in system.parameter_names))
+    for name, rate in zip(system.state_names, ca.vertsplit(system.f(x, u, *[p] * bool(system.np))), strict=True):
         model.set_rhs(name, rate)
     model.setup()
     return model
 
 
 def to_acados(system: System) -> Any:
-    """acados' AcadosModel of the system: x, u, xdot, explicit and implicit equations, in SX."""
-    system.refuse_parameters("to_acados")
+    """acados' AcadosModel of the system: x, u, xdot (t, p), explicit and implicit equations, in SX."""
     try:
         model = package("acados_template").AcadosModel()
     except ValueError as error:
         raise ValueError(f"{error}, or acados' own interfaces/acados_template") from None
-    model.name, (model.x, model.u) = system.name, (ca.SX(v) for v in system.arguments.inputs)
+    model.name, at = system.name, {name: ca.SX(v) for name, v in system.arguments.symbols.items()}
+    for name, symbol in at.items():
+        setattr(model, name, symbol)
     model.xdot = ca.SX.sym("xdot", system.nx)
-    model.f_expl_expr = system.f(model.x, model.u)
+    model.f_expl_expr = system.f(*at.values())
     model.f_impl_expr = model.xdot - model.f_expl_expr
     return model
 
@@ -91,14 +104,14 @@ def to_acados(system: System) -> Any:
 def to_gymnasium(ocp: OCP, *, steps: int = 80, integrator: str = "rk4", observe_time: bool = True) -> Any:
     """A gymnasium.Env of the problem: `steps` equal intervals over the horizon, controls held and clipped to U.
 
-    Observations are x, then t (unless observe_time is False), float64; actions are u in U; the reward of a step is
-    minus the integral of L over it, in the last step also minus G(x(T)): the return is minus the cost. Episodes are
-    terminated at the horizon, with a reward of the step's cost at the last finite state where the state blows up.
-    reset(options={"x0": x}) starts at a given state. info has "cost", the cost so far, and "clearance", the least path
-    constraint at the state. integrator: "rk4", the discretisation of NMPC, or "cvodes", the judge's. Path constraints
-    are reported, and not in the reward.
+    Observations are x, then t (unless observe_time is False), then p, float64; on a problem with parameters each
+    episode has its own. Actions are u in U; the reward of a step is minus the integral of L over it, in the last step
+    also minus G(x(T)): the return is minus the cost. Episodes are terminated at the horizon, with a reward of the
+    step's cost at the last finite state where the state blows up. reset(options={"x0": x, "p": p}) starts at a given
+    state and parameters. info has "cost", the cost so far, and "clearance", the least path constraint at the state.
+    integrator: "rk4", the discretisation of NMPC, or "cvodes", the judge's. Path constraints are reported, and not in
+    the reward.
     """
-    ocp.refuse_parameters("to_gymnasium")
     if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
         raise ValueError(f"to_gymnasium: steps is {steps!r}; expected an integer >= 1")
     if integrator not in ("rk4", "cvodes"):
@@ -108,30 +121,31 @@ def to_gymnasium(ocp: OCP, *, steps: int = 80, integrator: str = "rk4", observe_
     return _environment(gymnasium, ocp, int(steps), step, observe_time)
 
 
-def _step(ocp: OCP, h: float, integrator: str) -> Callable[[Array, Array], tuple[Array, float]]:
-    """(x, u) -> (x after h, the integral of L)."""
+def _step(ocp: OCP, h: float, integrator: str) -> Step:
+    """(x, u, t, p) -> (x after h, the integral of L)."""
+    at = ocp.functions.stage
     if integrator == "rk4":
         function = ocp.functions.step(soft=False)
 
-        def rk4(x: Array, u: Array) -> tuple[Array, float]:
-            after, cost = function(x, u, h)
+        def rk4(x: Array, u: Array, t: float, p: Array) -> tuple[Array, float]:
+            after, cost = function(*at.columns(x=x, u=u, t=t, p=p), h)
             return after.full().ravel(), float(cost)
 
         return rk4
-    at = ocp.functions.stage
-    z, ode = ca.vertcat(at.x, at.sym("cost")), ca.vertcat(at.xdot, at.L)
-    judge = ca.integrator("step", "cvodes", {"x": z, "p": at.u, "ode": ode}, 0.0, h, {"reltol": 1e-9, "abstol": 1e-10})
+    time = [at["t"]] if "t" in at.names else []
+    z, ode = ca.vertcat(at.x, at.sym("cost"), *time), ca.vertcat(at.xdot, at.L, *[1] * len(time))
+    held = ca.vertcat(*(at[name] for name in ("u", "p") if name in at.names))
+    judge = ca.integrator("step", "cvodes", {"x": z, "p": held, "ode": ode}, 0.0, h, {"reltol": 1e-9, "abstol": 1e-10})
 
-    def cvodes(x: Array, u: Array) -> tuple[Array, float]:
-        end = judge(x0=np.r_[x, 0.0], p=u)["xf"].full().ravel()
-        return end[:-1], float(end[-1])
+    def cvodes(x: Array, u: Array, t: float, p: Array) -> tuple[Array, float]:
+        end = judge(x0=np.r_[x, 0.0, [t] * len(time)], p=np.r_[u, p])["xf"].full().ravel()
+        return end[:len(x)], float(end[len(x)])
 
     return cvodes
 
 
-def _environment(gymnasium: Any, ocp: OCP, steps: int, step: Callable[[Array, Array], tuple[Array, float]],
-                 observe_time: bool) -> Any:
-    s, box = ocp.system, gymnasium.spaces.Box
+def _environment(gymnasium: Any, ocp: OCP, steps: int, step: Step, observe_time: bool) -> Any:
+    s, of, box = ocp.system, ocp.functions, gymnasium.spaces.Box
     free, time = np.full(s.nx, np.inf), [ocp.horizon] if observe_time else []
 
     class Environment(gymnasium.Env):  # type: ignore[misc]
@@ -139,15 +153,19 @@ def _environment(gymnasium: Any, ocp: OCP, steps: int, step: Callable[[Array, Ar
 
         def __init__(self) -> None:
             self.ocp, self.render_mode = ocp, None
-            self.observation_space = box(np.r_[-free, 0 * np.array(time)], np.r_[free, time], dtype=np.float64)
+            any_p = np.full(ocp.np, np.inf)
+            self.observation_space = box(np.r_[-free, 0 * np.array(time), -any_p], np.r_[free, time, any_p],
+                                         dtype=np.float64)
             self.action_space = box(s.lbu, s.ubu, dtype=np.float64)
-            self.k, self.x, self.cost = steps, np.array(ocp.x_goal), 0.0
+            self.k, self.x, self.cost, self.p = steps, np.array(ocp.x_goal), 0.0, ocp.nominal
 
         def reset(self, *, seed: int | None = None,
                   options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
             super().reset(seed=seed)
-            given = (options or {}).get("x0")
+            given, p = ((options or {}).get(name) for name in ("x0", "p"))
             x0 = ocp.initial_states.sample(1, self.np_random)[0] if given is None else given
+            self.p = (ocp.sample_parameters(1, self.np_random) if p is None else
+                      ocp.parameters_of(p, 1, f"environment of {s.name}"))[0]
             self.k, self.x, self.cost = 0, checks.vector(x0, s.nx, "x0", f"environment of {s.name}").copy(), 0.0
             return self._observation(), self._info()
 
@@ -155,23 +173,26 @@ def _environment(gymnasium: Any, ocp: OCP, steps: int, step: Callable[[Array, Ar
             if self.k >= steps:
                 raise ValueError("the episode is over; expected reset() before another step")
             u = np.clip(checks.vector(action, s.nu, "action", f"environment of {s.name}"), s.lbu, s.ubu)
-            x, cost = step(self.x, u)
+            t = self._time()
+            x, cost = step(self.x, u, t, self.p)
             blown = not (np.isfinite(x).all() and np.isfinite(cost))
             self.k = steps if blown else self.k + 1
             if blown:
-                cost = float(ocp.L(self.x, u)) * ocp.horizon / steps
+                cost = float(ocp.L(*of.arguments.columns(x=self.x, u=u, t=t, p=self.p))) * ocp.horizon / steps
             else:
                 self.x = x
-            cost += float(ocp.G(self.x)) if self.k == steps else 0.0
+            cost += float(ocp.G(*of.end.columns(x=self.x, p=self.p))) if self.k == steps else 0.0
             self.cost += cost
             return self._observation(), -cost, self.k == steps, False, self._info()
 
+        def _time(self) -> float:
+            return float(min(self.k * ocp.horizon / steps, ocp.horizon))  # not the last digit above it
+
         def _observation(self) -> Array:
-            time = min(self.k * ocp.horizon / steps, ocp.horizon)  # not the last digit above it
-            return np.r_[self.x, time] if observe_time else self.x.copy()
+            return np.r_[self.x, [self._time()] if observe_time else [], self.p]
 
         def _info(self) -> dict[str, Any]:
-            h = ocp.h(self.x).full().ravel()
+            h = ocp.h(*of.node.columns(x=self.x, t=self._time(), p=self.p)).full().ravel()
             return {"cost": self.cost, "clearance": float(h.min(initial=np.inf))}
 
     return Environment()
