@@ -14,15 +14,18 @@ import numpy as np
 import nocl
 from nocl.support.checks import Vector
 
+Constant = float | ca.SX  # a number, or an expression of parameters
+
 
 def system(
     *,
-    m1: float = 1.0, m2: float = 1.0,  # kg
+    m1: Constant = 1.0, m2: Constant = 1.0,  # kg
     l1: float = 1.0,  # m, length of the first link (the second one's does not enter)
     lc1: float = 0.5, lc2: float = 0.5,  # m, from a link's joint to its centre of mass
     I1: float = 1.0, I2: float = 1.0,  # kg m^2, about the centres of mass
     g: float = 9.8,  # m/s^2
     u_max: float = 5.0,  # N m, |u1|, |u2| <= u_max
+    parameters: ca.SX | None = None,  # those that stand in the masses
 ) -> nocl.System:
     """x = [th1, th2, w1, w2]: th1 = 0 hangs down, th2 is relative to link 1; u1 turns joint 2, -u2 joint 1."""
     th1, th2, w1, w2, u1, u2 = (ca.SX.sym(name) for name in ("th1", "th2", "w1", "w2", "u1", "u2"))
@@ -34,7 +37,7 @@ def system(
     dw1 = -(u2 + d2 * dw2 + phi1) / d1  # u2 against w1, and no share of it in dw2: ENODE's form
     return nocl.System(
         "acrobot", x=ca.vertcat(th1, th2, w1, w2), u=ca.vertcat(u1, u2), xdot=ca.vertcat(w1, w2, dw1, dw2),
-        lbu=[-u_max] * 2, ubu=[u_max] * 2, lbx=[-6.0] * 4, ubx=[6.0] * 4, angles=["th1", "th2"],
+        lbu=[-u_max] * 2, ubu=[u_max] * 2, lbx=[-6.0] * 4, ubx=[6.0] * 4, angles=["th1", "th2"], p=parameters,
         units={"th1": "rad", "th2": "rad", "w1": "rad/s", "w2": "rad/s", "u1": "N m", "u2": "N m"})
 
 

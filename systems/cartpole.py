@@ -12,26 +12,32 @@ import numpy as np
 import nocl
 from nocl.support.checks import Vector
 
+Constant = float | ca.SX  # a number, or an expression of parameters
+
 
 def system(
     *,
-    m_cart: float = 1.0,  # kg
-    m_pole: float = 0.1,  # kg
-    l: float = 1.0,  # m, half the pole's length: from the pivot to its centre of mass  # noqa: E741
+    m_cart: Constant = 1.0,  # kg
+    m_pole: Constant = 0.1,  # kg
+    l: Constant = 1.0,  # m, half the pole's length: from the pivot to its centre of mass  # noqa: E741
     g: float = 9.8,  # m/s^2
-    gain: float = 3.0,  # N, the force that u = 1 stands for
+    gain: Constant = 3.0,  # N, the force that u = 1 stands for
+    friction: Constant = 0.0,  # N s/m, of the cart against v
     u_max: float = 3.0,  # 1, |u| <= u_max
+    parameters: ca.SX | None = None,  # those that stand in the constants
 ) -> nocl.System:
     """x = [p, v, theta, omega]: theta = 0 is upright and grows clockwise, towards positive p; u pushes towards it."""
     p, v, theta, omega, u = (ca.SX.sym(name) for name in ("p", "v", "theta", "omega", "u"))
     sin, cos, m_total = ca.sin(theta), ca.cos(theta), m_cart + m_pole
-    temp = (gain * u + m_pole * l * omega**2 * sin) / m_total
+    push = gain * u if isinstance(friction, float) and not friction else gain * u - friction * v
+    temp = (push + m_pole * l * omega**2 * sin) / m_total
     alpha = (g * sin - cos * temp) / (l * (4 / 3 - m_pole * cos**2 / m_total))
     acceleration = temp - m_pole * l * alpha * cos / m_total
     return nocl.System(
         "cartpole", x=ca.vertcat(p, v, theta, omega), u=u, xdot=ca.vertcat(v, acceleration, omega, alpha),
-        lbu=[-u_max], ubu=[u_max], lbx=[-5.0] * 4, ubx=[5.0] * 4, angles=["theta"],
-        units={"p": "m", "v": "m/s", "theta": "rad", "omega": "rad/s", "u": f"{gain:g} N"})
+        lbu=[-u_max], ubu=[u_max], lbx=[-5.0] * 4, ubx=[5.0] * 4, angles=["theta"], p=parameters,
+        units={"p": "m", "v": "m/s", "theta": "rad", "omega": "rad/s",
+               "u": f"{gain} N" if isinstance(gain, ca.SX) else f"{gain:g} N"})
 
 
 def ocp(*, horizon: float = 4.0, R: Vector = 0.01, P: Vector = 1.0, std: float = 0.1,

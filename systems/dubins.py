@@ -28,10 +28,14 @@ def system(*, r: float = 0.5) -> nocl.System:
         units={"px": "m", "py": "m", "psi": "rad", "v": "m/s", "alpha": "1"})
 
 
-def distance(system: nocl.System, centre: Vector, radius: float) -> ca.SX:
-    """Distance to a disk, smoothed: sqrt(d^2 + e^2) - sqrt(radius^2 + e^2), zero on its edge, e^2 / (2 radius) off."""
-    d2 = ca.sumsqr(system.x[:2] - ca.DM(centre))
-    return ca.sqrt(d2 + SMOOTHING**2) - np.hypot(radius, SMOOTHING)
+def distance(system: nocl.System, centre: Vector | ca.SX, radius: float | ca.SX) -> ca.SX:
+    """Distance to a disk, smoothed: sqrt(d^2 + e^2) - sqrt(radius^2 + e^2), zero on its edge, e^2 / (2 radius) off.
+
+    centre [2] and radius may be expressions of parameters.
+    """
+    d2 = ca.sumsqr(system.x[:2] - (centre if isinstance(centre, ca.SX) else ca.DM(centre)))
+    edge = ca.sqrt(radius**2 + SMOOTHING**2) if isinstance(radius, ca.SX) else np.hypot(radius, SMOOTHING)
+    return ca.sqrt(d2 + SMOOTHING**2) - edge
 
 
 def ocp(*, horizon: float = 8.0, R: Vector = 0.01, P: Vector = 1.0, obstacle: bool = True,

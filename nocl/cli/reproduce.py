@@ -55,7 +55,12 @@ TABLES = {
                                "--oc-batch": "default: 1024 as published, with --quick 16"}, shipped=True),
     "approaches": TableCommand("nocl.comparisons.reproduce.approaches:TABLE",
                                "which approach gives what: time and memory by number of states",
-                               {"--problems": "default: six, of 2 to 12 states"})}
+                               {"--problems": "default: six, of 2 to 12 states"}),
+    "goals": TableCommand("nocl.comparisons.reproduce.goals:TABLE",
+                          "one controller for every goal, mass and obstacle: the paper's future work",
+                          {"--seeds": "controllers and sets of (x0, p); default: 1",
+                           "--n": "default: 200, with --quick 8", "--problems": "default: all seven",
+                           "--ways": "exact,learned; default: both"})}
 ALIASES = {"sysid": {"--problems": "--systems"}}  # other names of flags
 
 

@@ -1,0 +1,256 @@
+"""The paper's future work as a table: one controller u(x, t, p) for every goal, mass and obstacle.
+
+"Our method learns the controller for a fixed goal state, and requires re-optimization for new goal states": here each
+problem has parameters, each row is one controller of all of them, judged on fresh (x0, p), each against the best of
+many starts on the exact f at its own p.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import casadi as ca
+import numpy as np
+
+import nocl
+from nocl.comparisons.comparison import compare
+from nocl.comparisons.reproduce import table
+from nocl.comparisons.reproduce.table import Place, grid, number
+from nocl.comparisons.studies import FINE, with_reference
+from nocl.ocp import OCP
+from nocl.sampling import own_numbers
+from nocl.solvers.cnd.settings import TrainSettings
+from nocl.solvers.cnd.training import train
+from nocl.solvers.ddp.global_search import GlobalDDP
+from nocl.solvers.ddp.solver import DDP
+from nocl.support.checks import Array
+from nocl.sysid.identification import Settings, identify
+from nocl.systems import acrobot, cartpole, dubins, pendulum, quadrotor
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+CLEAR = 0.1  # m between the car's obstacle and its goal, in the problems that are judged
+Bounds = dict[str, tuple[float, float]]
+
+
+def _about(mean: Sequence[float], half: float) -> nocl.Uniform:
+    return nocl.Uniform(np.array(mean) - half, np.array(mean) + half)
+
+
+def _within(bounds: Bounds) -> nocl.Uniform:
+    low, high = zip(*bounds.values(), strict=True)
+    return nocl.Uniform(low, high)
+
+
+def _symbols(bounds: Bounds, units: dict[str, str] | None = None) -> dict[str, ca.SX]:
+    return {name: nocl.parameter(name, unit=(units or {}).get(name, "")) for name in bounds}
+
+
+def _cartpole(**plant: tuple[float, float]) -> OCP:
+    """Swing up and stop at a goal; some constants of the plant vary too."""
+    units = {"l": "m", "m_pole": "kg", "m_cart": "kg", "gain": "N", "friction": "N s/m"}
+    constants, goal = _symbols(plant, units), nocl.parameter("goal", 0.0, "m")
+    system = cartpole.system(**constants, parameters=ca.vertcat(*constants.values()) if constants else None)
+    return OCP.quadratic(system, p=goal, horizon=4.0, x_goal=[goal, 0, 0, 0], u_goal=[0],
+                         initial_states=_about([0, 0, np.pi, 0], 0.3),
+                         parameters=_within({**plant, "goal": (-2.0, 2.0)}))
+
+
+def _quadrotor() -> OCP:
+    """From rest anywhere in a box of 4 m to rest anywhere in it."""
+    bounds: Bounds = dict.fromkeys(("goal_x", "goal_y", "goal_z"), (-2.0, 2.0))
+    goal, system = ca.vertcat(*_symbols(bounds, dict.fromkeys(bounds, "m")).values()), quadrotor.system()
+    weight = float(-system.f(np.zeros(12), np.zeros(4))[8])
+    half = np.r_[np.full(3, 2.0), np.zeros(9)]
+    return OCP.quadratic(system, p=goal, horizon=4.0, x_goal=ca.vertcat(goal, np.zeros(9)), u_goal=[weight, 0, 0, 0],
+                         initial_states=nocl.Uniform(-half, half), parameters=_within(bounds))
+
+
+def _acrobot() -> OCP:
+    """Swing up with the second joint at an angle."""
+    masses: Bounds = dict.fromkeys(("m1", "m2"), (0.8, 1.2))
+    constants, goal = _symbols(masses, dict.fromkeys(masses, "kg")), nocl.parameter("goal", 0.0, "rad")
+    system = acrobot.system(**constants, parameters=ca.vertcat(*constants.values()))
+    return OCP.quadratic(system, p=goal, horizon=4.0, x_goal=[np.pi, goal, 0, 0], u_goal=[0, 0],
+                         initial_states=nocl.Gaussian(np.zeros(4), [0.1] * 4),
+                         parameters=_within({**masses, "goal": (-0.5, 0.5)}))
+
+
+def _dubins() -> OCP:
+    """A car round an obstacle of any size and place to any pose."""
+    bounds: Bounds = {"obstacle_x": (-1.5, -0.8), "obstacle_y": (-1.0, 1.0), "radius": (0.3, 0.6),
+                      "goal_x": (-0.5, 0.5), "goal_y": (-0.5, 0.5), "goal_psi": (-0.8, 0.8)}
+    p = _symbols(bounds, {**dict.fromkeys(bounds, "m"), "goal_psi": "rad"})
+    car = dubins.system()
+    clear = dubins.distance(car, ca.vertcat(p["obstacle_x"], p["obstacle_y"]), p["radius"])
+    return OCP.quadratic(car, p=ca.vertcat(*p.values()), horizon=8.0, x_goal=[*list(p.values())[3:]], u_goal=[0, 0],
+                         initial_states=nocl.Uniform([-3.5, -3.0, -1.57], [-2.5, 3.0, 1.57]),
+                         parameters=_within(bounds), path_constraints={"obstacle": clear})
+
+
+def _pendulum() -> OCP:
+    """Swing up to an angle, with another mass."""
+    mass, goal = nocl.parameter("mass", 1.0, "kg"), nocl.parameter("goal", 0.0, "rad")
+    return OCP.quadratic(pendulum.system(mass=mass, parameters=mass), p=goal, horizon=3.0, x_goal=[goal, 0],
+                         u_goal=[0], initial_states=nocl.Gaussian([np.pi, 0], [0.1, 0.1]),
+                         parameters=nocl.Uniform([0.7, -0.5], [1.3, 0.5]))
+
+
+POLE: Bounds = {"l": (0.7, 1.3), "m_pole": (0.07, 0.13)}
+CART: Bounds = {"m_cart": (0.7, 1.3), "gain": (2.1, 3.9), "friction": (0.0, 0.5)}
+PROBLEMS: dict[str, tuple[str, Callable[[], OCP]]] = {
+    "cartpole-goal": ("cart-pole: goal", _cartpole),
+    "cartpole-pole": ("cart-pole: goal, length, pole's mass", lambda: _cartpole(**POLE)),
+    "cartpole-all": ("cart-pole: goal, length, both masses, gain, friction", lambda: _cartpole(**POLE, **CART)),
+    "quadrotor-goal": ("quadrotor: goal and start anywhere in a 4 m box", _quadrotor),
+    "acrobot-goal": ("acrobot: angle of joint 2, both masses", _acrobot),
+    "dubins-obstacle": ("dubins: obstacle, its radius, goal pose", _dubins),
+    "pendulum-goal": ("pendulum: goal, mass", _pendulum)}
+
+
+def drawn(ocp: OCP, n: int, seed: int) -> tuple[Array, Array]:
+    """n initial states and parameters that no training saw; goals inside an obstacle, or next to it, are left out."""
+    x0, p = ocp.initial_states.sample(4 * n, own_numbers(seed, 7)), ocp.sample_parameters(4 * n, own_numbers(seed, 8))
+    of = ocp.functions.node
+    h = np.array([ocp.h(*of.columns(x=x, t=[0.0], p=p)).full().min(axis=0, initial=np.inf)
+                  for x in (x0, ocp.goals(p)[0])]).min(axis=0)
+    rows = np.flatnonzero(h > CLEAR)[:n]
+    return x0[rows], p[rows]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan(table.Plan):
+    """Which problems, exact and learned."""
+
+    n: int = 200  # (x0, p) of each seed
+
+
+@dataclass(frozen=True)
+class Way:
+    """A row of the table."""
+
+    title: str
+    learned: bool
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One controller on n fresh (x0, p)."""
+
+    problem: str
+    way: str
+    seed: int
+    key: dict[str, Any]
+    gap: list[float]  # (J - J*) / J* of each, inf where the run failed
+    collisions: int
+    identify: float  # s of learning f(x, u, p); 0 on the exact f
+    seconds: float  # of training, wall-clock
+    cpu: float  # the same in seconds of CPU time
+
+    @property
+    def place(self) -> Place:
+        return Place(self.problem, self.way, self.seed)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A row: over all (x0, p) of all seeds."""
+
+    problem: str
+    way: str
+    median: float  # %
+    p95: float
+    worst: float
+    collisions: int
+    n: int
+    identify: float
+    seconds: float
+    cpu: float
+
+
+class Goals(table.PaperTable[Plan, Cell, Entry]):
+    """The table of goals."""
+
+    name, title, known, file = "goals", "goals", "the table of goals", "goals-{problem}-{way}-{seed}"
+    plan_type, cell_type = Plan, Cell
+    problems, numbers = tuple(PROBLEMS), ("gap",)
+    ways: ClassVar[dict[str, Way]] = {"exact": Way("f", False), "learned": Way("f_theta(x, u, p)", True)}
+    quick: ClassVar[dict[str, int]] = {"n": 8}
+    least: ClassVar[dict[str, int]] = {"seeds": 1, "n": 1}
+
+    def key(self, plan: Plan, place: Place) -> dict[str, Any]:
+        return {"n": plan.n, "quick": plan.quick}
+
+    def make(self, plan: Plan, place: Place, folder: Path) -> Cell:
+        ocp, effort, start = PROBLEMS[place.problem][1](), "quick" if plan.quick else "normal", time.perf_counter()
+        model = identify(ocp.system, parameters=ocp.plant_parameters, seed=place.seed, settings=Settings.of(effort),
+                         progress=False) if self.ways[place.way].learned else None
+        identified = 0.0 if model is None else time.perf_counter() - start
+        start, cpu = time.perf_counter(), time.process_time()
+        cnd = train(ocp, model, seed=place.seed, settings=TrainSettings.of(effort, value=False), progress=False)
+        seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
+        gap, collisions = judged(ocp, cnd, plan.n, place.seed)
+        return Cell(*place, self.key(plan, place), gap.tolist(), collisions, identified, seconds, cpu)
+
+    def entries(self, cells: Sequence[Cell]) -> list[Entry]:
+        groups = [(problem, way, [c for c in cells if (c.problem, c.way) == (problem, way)])
+                  for problem in self.problems for way in self.ways]
+        return [_entry(problem, way, own) for problem, way, own in groups if own]
+
+    def columns(self) -> list[table.Column[Entry]]:
+        return [("problem: parameters", lambda e: PROBLEMS[e.problem][0]),
+                ("trained on", lambda e: self.ways[e.way].title),
+                ("median gap %", lambda e: number(e.median)), ("95th percentile", lambda e: number(e.p95)),
+                ("worst", lambda e: number(e.worst)), ("collisions", lambda e: f"{e.collisions} of {e.n}"),
+                ("training s", lambda e: number(e.seconds)), ("CPU s", lambda e: number(e.cpu)),
+                ("f learned s", lambda e: number(e.identify) if e.identify else "")]
+
+    def row(self, entry: Entry) -> dict[str, Any]:
+        return vars(entry)
+
+    def latex(self, entries: Sequence[Entry]) -> str:
+        head = [r"problem: parameters & trained on & median & 95 \% & worst & training s \\"]
+        body = [([PROBLEMS[e.problem][0], self.ways[e.way].title.replace("_", r"\_"), number(e.median), number(e.p95),
+                  number(e.worst), number(e.seconds)], [""] * 6) for e in entries]
+        return grid("llrrrr", head, body)
+
+    def figures(self, entries: Sequence[Entry], cells: Sequence[Cell]) -> dict[str, Figure]:
+        """The gaps of all (x0, p), sorted: the share of them below a gap."""
+        from matplotlib.figure import Figure  # matplotlib is imported where pictures are drawn
+
+        figure = Figure(figsize=(7, 4.2), layout="constrained")
+        axes = figure.subplots()
+        for e in entries:
+            gaps = np.sort(100 * np.concatenate([c.gap for c in cells if (c.problem, c.way) == (e.problem, e.way)]))
+            axes.step(np.maximum(gaps, 1e-4), np.arange(1, len(gaps) + 1) / len(gaps), where="post",
+                      label=f"{PROBLEMS[e.problem][0]}, {self.ways[e.way].title}", lw=1.3)
+        axes.set(xscale="log", xlabel="gap to the optimum at its own p [%]", ylabel="share of (x0, p)", ylim=(0, 1.01))
+        axes.legend(fontsize=6)
+        return {"": figure}
+
+
+def judged(ocp: OCP, cnd: Any, n: int, seed: int) -> tuple[Array, int]:
+    """(gap of each fresh (x0, p), collisions); the optimum from many starts, refined on FINE intervals."""
+    x0, p = drawn(ocp, n, seed)
+    report = compare(ocp, {"CND": cnd, "optimum": GlobalDDP(DDP(ocp, intervals=80), starts=32)}, x0=x0, p=p,
+                     progress=False)
+    report = with_reference(report, FINE)
+    gap = np.where(report.judged[0].simulation.success, report.gap[0] / 100, np.inf)
+    return gap, int((report.judged[0].simulation.violation > 0).sum())
+
+
+def _entry(problem: str, way: str, cells: Sequence[Cell]) -> Entry:
+    gap = 100 * np.concatenate([c.gap for c in cells])
+    median, p95 = np.percentile(gap, [50, 95], method="higher")
+    known = {what: float(np.mean([getattr(c, what) for c in cells])) for what in ("identify", "seconds", "cpu")}
+    worst = float(gap.max()) if len(gap) else math.nan
+    return Entry(problem, way, float(median), float(p95), worst, sum(c.collisions for c in cells), len(gap), **known)
+
+
+TABLE = Goals()
