@@ -16,7 +16,9 @@ import numpy as np
 
 from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
+from nocl.parameters import time
 from nocl.scales import usual_sizes
+from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.translate.arguments import Arguments
 
@@ -40,11 +42,44 @@ class Places(Protocol):
     def p(self) -> Array: ...
 
 
-def features(ocp: OCP, labels: Places, dt: Array | None = None, *, plain: bool = False) -> ca.Function:
+def own_features(ocp: OCP, given: Any) -> ca.Function | None:
+    """A user's features, SX expressions in states, parameters and time, as a function of (x, t[, p]); None for none.
+
+    Raises ValueError for anything else.
+    """
+    if given is None:
+        return None
+    at, owner = ocp.functions.feedback(), f"train({ocp.system.name}): features"
+    column = checks.column(given)
+    if not isinstance(column, ca.SX) or not column.numel():
+        raise ValueError(f"{owner} is {checks.shown(given)}; expected SX expressions in the states, parameters and "
+                         "nocl.time(), like [ca.sin(x[0] - goal)]")
+    s, known = ocp.system, {"x": ocp.system.x, "t": time(), "p": ca.vertcat(ocp.system.p, ocp.p)}
+    checks.expression(column, column.numel(), ca.vertcat(s.x, known["p"]), "features", f"train({s.name})", time=time())
+    own = ca.Function("own", [known[name] for name in at.names], [column], at.names, ["own"])
+    _check_images(ocp, own, owner)
+    return own
+
+
+def _check_images(ocp: OCP, own: ca.Function, owner: str) -> None:
+    """ValueError where features tell images of a state apart that the problem does not."""
+    n, s = 32, ocp.system
+    x = np.random.default_rng(0).uniform(s.lbx, s.ubx, (n, s.nx))
+    turned = x + 2 * np.pi * np.isin(np.arange(s.nx), list(ocp.periodic))
+    a, b = (own(*ocp.functions.feedback().columns(x=rows, **ocp.moments(n))).full() for rows in (x, turned))
+    bad = np.flatnonzero(~np.isclose(a, b, rtol=1e-6, atol=1e-9, equal_nan=True).all(axis=1))
+    if bad.size:
+        names = ", ".join(s.state_names[i] for i in ocp.periodic)
+        raise ValueError(f"{owner}: number {bad[0]} changes with a whole turn of {names}, and the problem does not; "
+                         "expected sines and cosines of such angles")
+
+
+def features(ocp: OCP, labels: Places, dt: Array | None = None, *, plain: bool = False,
+             own: ca.Function | None = None) -> ca.Function:
     """(x, t[, p]) -> phi, each feature with mean 0 and standard deviation 1 over the labels' x, t, p.
 
     With dt [n] it is (x, t[, p], dt) -> phi: the clock then stands at the middle of the time that a control is held
-    for. `plain` adds the state in units that do not change with time.
+    for. `plain` adds the state in units that do not change with time; `own` are a user's, of (x, t[, p]).
     """
     s, at, (x, t) = ocp.system, ocp.functions.feedback(), (labels.x, labels.t)
     if dt is not None:
@@ -63,12 +98,17 @@ def features(ocp: OCP, labels: Places, dt: Array | None = None, *, plain: bool =
                          (rush, np.array([1.0 if i in ocp.periodic else half[i] for i in range(s.nx)])),
                          *([(state[once], half[once])] if plain else []),
                          *_of_parameters(ocp, at, off, labels, tau, moment),
+                         *([] if own is None else [(at.but("dt").call(own), 0.0)]),
                          *([] if dt is None else [(at["dt"], ocp.horizon)])]
     raw = ca.vertcat(*(e for e, _ in parts))
     usual = np.concatenate([np.broadcast_to(size, e.numel()) for e, size in parts])
     given = at.columns(x=x, t=t, p=labels.p, dt=dt)
     some = slice(None, None, -(-len(t) // 20_000))  # of every kind of label
     values = at.function("raw", {"raw": raw})(*(a[:, some] for a in given)).full()
+    if not np.isfinite(values).all():
+        raise ValueError(f"features of {s.name!r} are NaN or inf at some labels; expected expressions that are finite "
+                         "all over X")
+    usual = np.where(usual > 0, usual, np.abs(values).max(axis=1, initial=1e-300))
     centre, width = values.mean(axis=1), values.std(axis=1) + CONSTANT * usual
     return at.function("features", {"phi": (raw - ca.DM(centre)) / ca.DM(width)})
 
@@ -122,14 +162,14 @@ def _polynomial(coefficients: Array, tau: ca.SX) -> ca.SX:
     return ca.DM(coefficients) @ ca.vertcat(*basis[: coefficients.shape[1]])
 
 
-def policy_net(ocp: OCP, labels: Labels, sizes: tuple[int, ...],
-               control_dt: bool = False) -> tuple[FeatureNet, ca.Function]:
+def policy_net(ocp: OCP, labels: Labels, sizes: tuple[int, ...], control_dt: bool = False,
+               own: ca.Function | None = None) -> tuple[FeatureNet, ca.Function]:
     """(u = clip(mean + spread * y, U), y a tanh network of the features; and u -> y, its inverse inside U).
 
-    control_dt: (x, t[, p], dt) -> u in place of (x, t[, p]) -> u.
+    control_dt: (x, t[, p], dt) -> u in place of (x, t[, p]) -> u. own: further features.
     """
     s = ocp.system
-    phi = features(ocp, labels, labels.dt if control_dt else None)
+    phi = features(ocp, labels, labels.dt if control_dt else None, own=own)
     mean, spread = ca.DM(labels.u.mean(axis=0)), ca.DM(labels.u.std(axis=0) + 1e-9 * usual_sizes(ocp).u)
     y, u = ca.SX.sym("y", s.nu), ca.SX.sym("u", s.nu)
     clipped = ca.fmin(ca.fmax(mean + spread * y, ca.DM(s.lbu)), ca.DM(s.ubu))

@@ -23,6 +23,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import casadi as ca
 import numpy as np
 import torch
 from tqdm import tqdm
@@ -32,7 +33,7 @@ from nocl.nets import FeatureNet
 from nocl.ocp import OCP
 from nocl.sampling import own_numbers
 from nocl.solvers.cnd.controller import CND
-from nocl.solvers.cnd.features import at_rate, policy_net
+from nocl.solvers.cnd.features import at_rate, own_features, policy_net
 from nocl.solvers.cnd.identity import identity
 from nocl.solvers.cnd.in_torch import InTorch
 from nocl.solvers.cnd.labels import Labels, Problems, at_other_rates, tube, visited
@@ -57,6 +58,7 @@ from nocl.solvers.ddp.solver import DDP, substeps_for
 from nocl.substeps import FINE
 from nocl.support import checks, store
 from nocl.support.checks import Array
+from nocl.support.fingerprint import fingerprint
 from nocl.support.threads import one_thread
 
 if TYPE_CHECKING:
@@ -72,7 +74,7 @@ LOSSES = 40  # of each regression that the card keeps
 
 def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "default",
           settings: TrainSettings | PaperSettings | None = None, seed: int = 0,
-          out: str | os.PathLike[str] | None = None, progress: bool | None = None) -> CND:
+          out: str | os.PathLike[str] | None = None, progress: bool | None = None, features: Any = None) -> CND:
     """Train a controller and a value function for all of an OCP's initial states.
 
     Parameters
@@ -89,6 +91,9 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
         Where checkpoints go: a call with the same arguments goes on from the last one.
     progress : bool, optional
         Whether to show progress; by default where the terminal is one.
+    features : SX expressions in states, parameters and nocl.time(), optional
+        What the networks see beside nocl's own features, where the user knows what matters: the angle to an obstacle,
+        the energy. Finite all over X.
     """
     _check(ocp, dynamics, seed, out)
     checks.word(method, ("default", "paper"), "method", "train")
@@ -96,10 +101,13 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
         chosen = _expect(settings, PaperSettings)
         checkpoint = None if out is None else Path(out) / CHECKPOINT
         ocp.refuse_parameters("train(method='paper')")
+        if features is not None:
+            raise ValueError("train: features are for the default method; 'paper' has the paper's own: leave them out")
         policy, value, card = train_paper(ocp, dynamics, chosen, seed=seed, progress=progress, checkpoint=checkpoint)
         return CND(ocp, policy, value, card)
     ocp.check_strict("train")
-    return Training(ocp, dynamics, _expect(settings, TrainSettings), seed, out, progress).run()
+    own = own_features(ocp, features)
+    return Training(ocp, dynamics, _expect(settings, TrainSettings), seed, out, progress, own).run()
 
 
 def _check(ocp: OCP, dynamics: LearnedDynamics | None, seed: int, out: str | os.PathLike[str] | None) -> None:
@@ -125,7 +133,8 @@ class Training:
     """One run of the default method; its state between rounds is what a checkpoint holds."""
 
     def __init__(self, ocp: OCP, dynamics: LearnedDynamics | None, settings: TrainSettings, seed: int,
-                 out: str | os.PathLike[str] | None, progress: bool | None) -> None:
+                 out: str | os.PathLike[str] | None, progress: bool | None, own: ca.Function | None = None) -> None:
+        self.own = own
         self.ocp, self.settings, self.seed = ocp, settings, seed
         self.learned = dynamics is not None
         self.in_torch = InTorch(ocp, dynamics)
@@ -200,7 +209,7 @@ class Training:
         """The policy's networks, scaled by the first labels."""
         with _seeded(self.seed):
             self.net, self.inverse = policy_net(self.ocp, self.labels[: self.first], self.settings.hidden,
-                                                self.settings.control_dt)
+                                                self.settings.control_dt, self.own)
         self.policy = at_rate(self.net, 0.0) if self.settings.control_dt else self.net  # in continuous time
 
     def _visit(self) -> None:
@@ -254,7 +263,7 @@ class Training:
             labels = ValueLabels.join([labels, self._value_labels(rng)])
             if attempt == 0:
                 with _seeded(self.seed + 1):
-                    net = value_net(self.ocp, labels, s.hidden)
+                    net = value_net(self.ocp, labels, s.hidden, self.own)
             losses += self._fit_value(net, labels, attempt)
             scores = value_scores(net, self.policy, self.in_torch, optima)
             worst = float(np.max([scores[f"{name}_error"] for name in optima]))
@@ -308,14 +317,14 @@ class Training:
         return report.kept
 
     def _card(self) -> dict[str, Any]:
-        last = self.history[-1]
+        last, own = self.history[-1], {} if self.own is None else {"features": self.own.numel_out(0)}
         return {"method": "default", "dynamics": "learned" if self.learned else "exact", "seed": self.seed,
                 **{name: last[name] for name in ("gap_median", "gap_p95", "kicked_median", "kicked_p95", "unsolved")},
                 "seconds": round(self.seconds, 1),
                 "fitting_seconds": round(self.fitting, 1),  # of these, fits of networks; the others solve problems
                 "fitting_cpu_seconds": round(self.fitting_cpu, 1),
                 "dynamics_evaluations": self._evaluations(), "substeps": self.substeps,
-                "settings": asdict(self.settings), "history": self.history, "value": self.value_card}
+                "settings": asdict(self.settings), **own, "history": self.history, "value": self.value_card}
 
     def _evaluations(self) -> int:
         """Of f, in rollouts of DDP, one for each state; those before a checkpoint included."""
@@ -334,7 +343,8 @@ class Training:
         return own_numbers(self.seed, stage)
 
     def _identity(self) -> str:
-        return identity(self.ocp, self.settings, self.seed, self.in_torch.function["f"])
+        known = identity(self.ocp, self.settings, self.seed, self.in_torch.function["f"])
+        return known if self.own is None else fingerprint(known, self.own)
 
     def _save(self) -> None:
         if self.checkpoint is None:

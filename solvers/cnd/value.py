@@ -88,10 +88,13 @@ def on_fine_grid(fine: DDP, coarse: Solution) -> Iterator[Solution]:
         yield refined(fine, coarse[start:start + PIECE])
 
 
-def value_net(ocp: OCP, labels: ValueLabels, sizes: tuple[int, ...]) -> FeatureNet:
-    """(x, t[, p]) -> V = floor + unit |y|^2; the floor is 0 where all labels are positive, else below them."""
+def value_net(ocp: OCP, labels: ValueLabels, sizes: tuple[int, ...], own: ca.Function | None = None) -> FeatureNet:
+    """(x, t[, p]) -> V = floor + unit |y|^2; the floor is 0 where all labels are positive, else below them.
+
+    own: further features.
+    """
     s, at = ocp.system, ocp.functions.feedback()
-    phi = features(ocp, labels, plain=True)
+    phi = features(ocp, labels, plain=True, own=own)
     y, floor = ca.SX.sym("y", s.nx + 1), _floor(labels)
     unit = float(np.median(labels.V - floor))
     V = at.function("value", {"V": floor + unit * ca.sumsqr(y)}, y=y)
