@@ -246,8 +246,7 @@ def test_kinks_count_in_states_and_controls_only():
     assert dataclasses.replace(ocp, running=ocp.running + ca.fabs(goal) * ca.fabs(nocl.time() - 1)).kinks == ()
 
 
-REFUSED = [("train(method='paper')", lambda ocp: nocl.train(ocp, method="paper")), ("LQR", LQR),
-           ("RRTStar", lambda ocp: RRTStar(ocp, iterations=5)), ("to_gymnasium", nocl.to_gymnasium)]
+REFUSED = [("LQR", LQR), ("RRTStar", lambda ocp: RRTStar(ocp, iterations=5))]
 
 
 @pytest.mark.parametrize(("owner", "use"), REFUSED)
@@ -259,11 +258,9 @@ def test_what_has_no_parameters_yet_says_so(owner, use):
         use(cart().at(p=[1, 0]))
 
 
-@pytest.mark.parametrize("use", [nocl.identify, nocl.to_control, nocl.to_acados, nocl.to_do_mpc,
-                                 lambda system: nocl.Dataset.sample(system, 3)])
-def test_a_system_with_parameters_is_refused_where_nothing_is_done_with_them(use):
+def test_a_system_with_parameters_is_refused_where_nothing_is_done_with_them():
     with pytest.raises(ValueError, match=r"not implemented for the parameter\(s\) mass.*system.at\(p="):
-        use(cart(timed=False).system)
+        nocl.Dataset.sample(cart(timed=False).system, 3)
 
 
 def test_folded_in_they_are_anybodys():

@@ -39,8 +39,10 @@ from nocl import hjb
 from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.cnd.identity import identity
+from nocl.solvers.cnd.lifted import Lifted
 from nocl.solvers.cnd.settings import STEPS, PaperSettings
 from nocl.support import store
+from nocl.support.checks import Array
 from nocl.translate.arguments import Arguments
 from nocl.translate.fused import FusedStep
 from nocl.translate.torch_functions import to_torch
@@ -101,7 +103,7 @@ def train_paper(ocp: OCP, dynamics: Any = None, settings: PaperSettings | None =
 
     Parameters
     ----------
-    dynamics : None for the exact f, a LearnedDynamics, or any torch callable (x [B, nx], u [B, nu]) -> xdot
+    dynamics : None for the exact f, a LearnedDynamics, or any torch callable (x [B, nx], u [B, nu][, p]) -> xdot
     seed : of initial networks and initial states; the caller's own generators are left alone
     progress : a bar with the loss terms and the time left; None: where the terminal is one
     callback : called as callback(iteration, terms) after each iteration of the joint training
@@ -112,12 +114,18 @@ def train_paper(ocp: OCP, dynamics: Any = None, settings: PaperSettings | None =
     Raises ValueError where training diverges, naming the iteration and what to try.
     """
     settings = settings or PaperSettings()
-    trainer = Trainer(ocp, dynamics, settings, seed, progress, device, dtype)
+    if ocp.np or ocp.uses_time:
+        of = Lifted(ocp)
+        trainer = Trainer(of.ocp, of.dynamics(dynamics), settings, seed, progress, device, dtype, of.sample)
+    else:
+        trainer = Trainer(ocp, dynamics, settings, seed, progress, device, dtype)
     named = f"{type(dynamics)}{getattr(dynamics, '__qualname__', '')}"  # of a plain callable its name alone is known
     key = identity(ocp, settings, seed, trainer.f, dtype=str(dtype), dynamics=named)
     run = _Training.resumed(trainer, checkpoint, key) or _Training.raced(trainer)
     run.train(callback, None if checkpoint is None else lambda: run.save(checkpoint, key))
     policy, value = run.best.networks(settings)
+    if ocp.np or ocp.uses_time:
+        policy, value = of.lowered(policy), of.lowered(value)
     card = {"method": "paper", "settings": asdict(settings), "seed": seed, "dtype": str(dtype).removeprefix("torch."),
             "dynamics": "exact" if dynamics is None else "learned", "race": run.race, "race_seconds": run.race_seconds,
             "seconds": run.seconds, "dynamics_evaluations": trainer.evaluations, "iterations": len(run.rows),
@@ -130,7 +138,9 @@ class Trainer:
     """One training: the problem in torch, and its random numbers."""
 
     def __init__(self, ocp: OCP, dynamics: Any, settings: PaperSettings, seed: int, progress: bool | None,
-                 device: str | torch.device, dtype: torch.dtype) -> None:
+                 device: str | torch.device, dtype: torch.dtype,
+                 draw: Callable[[int, np.random.Generator], Array] | None = None) -> None:
+        self.draw = draw or ocp.initial_states.sample
         self.ocp, self.settings, self.device, self.dtype = ocp, settings, device, dtype
         self.hidden = None if progress is None else not progress  # None: where the terminal is none
         self.f = _torch_dynamics(ocp, dynamics, device, dtype)
@@ -146,7 +156,7 @@ class Trainer:
 
     def states(self, *batch: int) -> Tensor:
         """Fresh initial states [*batch, nx]."""
-        x0 = self.ocp.initial_states.sample(math.prod(batch), self.rng).reshape(*batch, -1)
+        x0 = self.draw(math.prod(batch), self.rng).reshape(*batch, -1)
         return torch.as_tensor(x0, dtype=self.dtype, device=self.device)
 
     def rollout(self, policy: hjb.Map, x0: Tensor, hold: bool) -> hjb.Rollout:

@@ -100,7 +100,6 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
     if method == "paper":
         chosen = _expect(settings, PaperSettings)
         checkpoint = None if out is None else Path(out) / CHECKPOINT
-        ocp.refuse_parameters("train(method='paper')")
         if features is not None:
             raise ValueError("train: features are for the default method; 'paper' has the paper's own: leave them out")
         policy, value, card = train_paper(ocp, dynamics, chosen, seed=seed, progress=progress, checkpoint=checkpoint)
