@@ -95,6 +95,7 @@ class Uniform:
 
 
 Distribution = Gaussian | Uniform
+STILL = 1e-2
 BULK = 4.0  # standard deviations: one normal number in 16,000 is further from the mean
 
 
@@ -103,6 +104,13 @@ def box(distribution: Distribution) -> tuple[Array, Array]:
     if isinstance(distribution, Uniform):
         return distribution.lb, distribution.ub
     return distribution.mean - BULK * distribution.std, distribution.mean + BULK * distribution.std
+
+
+def open_box(distribution: Distribution) -> tuple[Array, Array]:
+    """The same with an inside: a coordinate that is held fixed has STILL of its value, or of 1, on either side."""
+    low, high = box(distribution)
+    least = np.where(high > low, 0.0, STILL * np.where(low == 0, 1.0, np.abs(low)))
+    return low - least, high + least
 
 
 def to_data(distribution: Distribution) -> dict[str, Any]:

@@ -36,14 +36,22 @@ from nocl.support.threads import one_thread
 from nocl.sysid import paper
 from nocl.sysid.figures import slices
 from nocl.sysid.from_log import first_states, fit_log
-from nocl.sysid.labels import Source, box_of, data_box, find_structure, labelled, rows_of, some_labels
+from nocl.sysid.labels import (
+    Source,
+    box_of,
+    data_box,
+    find_structure,
+    labelled,
+    rows_of,
+    some_labels,
+    widened,
+)
 from nocl.sysid.logs.coverage import Coverage, share_of_nodes
 from nocl.sysid.logs.known_rows import contradictions_of
 from nocl.sysid.logs.log import Log
 from nocl.sysid.logs.shooting import WindowFit
 from nocl.sysid.logs.validation import HORIZONS, Validation, validate
-from nocl.sysid.networks import assemble, fit_group, fit_groups, weights_of
-from nocl.sysid.parameters import apart, together, widened
+from nocl.sysid.networks import apart, assemble, fit_group, fit_groups, together, weights_of
 from nocl.sysid.progress import Checkpoint, Progress
 from nocl.sysid.score import Score, contradictions, score_of
 from nocl.sysid.settings import LogSettings, PaperSettings, Settings

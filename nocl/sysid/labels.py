@@ -9,6 +9,7 @@ import casadi as ca
 import numpy as np
 
 from nocl.data import Dataset
+from nocl.sampling import Distribution, open_box
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
 from nocl.sysid import structure as structures
@@ -20,6 +21,15 @@ from nocl.system import System
 
 CHUNK = 100_000  # labels of f held at a time
 MIN_ROWS = 2048  # of labels, however many labels of f one takes
+
+
+def widened(system: System, parameters: Distribution | None) -> System:
+    """The system with its parameters after its controls, in the box of their distribution; itself where it has none."""
+    if parameters is None:
+        return system
+    low, high = open_box(parameters)
+    return replace(system, u=ca.vertcat(system.u, system.p), p=None, lbu=np.r_[system.lbu, low],
+                   ubu=np.r_[system.ubu, high])
 
 
 def box_of(system: System) -> Variables:

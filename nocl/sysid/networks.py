@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -19,6 +20,8 @@ from nocl.sysid.plain import train as train_plain
 from nocl.sysid.progress import Checkpoint, Progress
 from nocl.sysid.settings import Budget, Settings
 from nocl.sysid.structure import Group, Structure, Variables
+from nocl.system import System
+from nocl.translate.arguments import Arguments
 
 MAX_POLISHED = 2600  # parameters: beyond, a Levenberg-Marquardt step costs more than it gives
 PROBES = 256  # rows at which the frequencies of the first layer are measured
@@ -271,3 +274,26 @@ def assemble(parts: Structure, weights: Sequence[fitting.Weights], angles: bool)
     inputs = at.function("features", {f"phi{i}": p for i, p in enumerate(phi)})
     outputs = at.function("xdot", {"xdot": parts.xdot(learned, z)}, **y)
     return FeatureNet(inputs, [_mlp(w) for w in weights], outputs).eval()
+
+
+def apart(net: FeatureNet, system: System) -> FeatureNet:
+    """A network of (x, (u, p)) as one of (x, u, p), for a system with parameters."""
+    at = system.arguments
+    return _through(net, at, at.given(u=ca.vertcat(at["u"], at["p"])).but("p"))
+
+
+def together(net: FeatureNet, system: System) -> FeatureNet:
+    """A network of (x, u, p) as one of (x, (u, p))."""
+    at = Arguments.new(ca.SX, x=system.nx, u=system.nu + system.np)
+    return _through(net, at, at.given(u=at["u"][:system.nu], p=at["u"][system.nu:]))
+
+
+def _through(net: FeatureNet, at: Arguments, given: Arguments) -> FeatureNet:
+    """A network whose arguments are `at`, and stand in the old one's as `given` has them."""
+    phi = net.inputs.call(given.inputs)
+    y = {net.outputs.name_in(i): ca.SX.sym(net.outputs.name_in(i), net.outputs.numel_in(i))
+         for i in range(net.inputs.n_in(), net.outputs.n_in())}
+    inputs = at.function(net.inputs.name(), dict(zip(net.inputs.name_out(), phi, strict=True)))
+    value = net.outputs(*given.inputs, *y.values())
+    outputs = at.function(net.outputs.name(), {net.outputs.name_out(0): value}, **y)
+    return FeatureNet(inputs, cast(Sequence[MLP], net.nets), outputs).eval()

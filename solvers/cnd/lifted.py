@@ -15,15 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-import nocl
 from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
 from nocl.parameters import time
-from nocl.sampling import Uniform
+from nocl.sampling import Uniform, box, open_box
 from nocl.support.checks import Array
 from nocl.system import System
-
-STILL = 1e-2  # half the width of a parameter's box where it is held fixed, of its value
 
 
 class Lifted:
@@ -43,17 +40,17 @@ class Lifted:
         return ca.substitute(expression, time(), self.clock[0]) if self.clock else expression
 
     def _system(self) -> System:
-        s, (low, high) = self.of.system, self.of.parameter_box
-        least = np.where(high > low, 0.0, STILL * np.where(low == 0, 1.0, np.abs(low)))
+        s, p = self.of.system, self.of.parameters
+        low, high = (np.zeros(0), np.zeros(0)) if p is None else open_box(p)
         known = [1.0] * len(self.clock) + [0.0] * self.of.np
         xdot = None if s.xdot is None else ca.vertcat(self._at(s.xdot), *known)
         T = [self.of.horizon] * len(self.clock)
         return replace(s, x=ca.vertcat(s.x, *self.clock, self.p), p=None, xdot=xdot, units={},
-                       lbx=np.r_[s.lbx, np.zeros(len(T)), low - least], ubx=np.r_[s.ubx, T, high + least])
+                       lbx=np.r_[s.lbx, np.zeros(len(T)), low], ubx=np.r_[s.ubx, T, high])
 
     def _box(self) -> Uniform:
         """Where the initial states lie, roughly: they are drawn by `sample`."""
-        low, high = nocl.sampling.box(self.of.initial_states)
+        low, high = box(self.of.initial_states)
         zero = np.zeros(len(self.clock))
         p = self.of.parameter_box
         return Uniform(np.r_[low, zero, p[0]], np.r_[high, zero, p[1]])
