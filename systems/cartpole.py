@@ -6,6 +6,8 @@ IEEE Trans. SMC 13(5), appendix, without friction: a uniform pole (inertia m l^2
 
 from __future__ import annotations
 
+from typing import Any
+
 import casadi as ca
 import numpy as np
 
@@ -41,7 +43,7 @@ def system(
 
 
 def ocp(*, horizon: float = 4.0, R: Vector = 0.01, P: Vector = 1.0, std: float = 0.1,
-        **constants: float) -> nocl.OCP:
+        **constants: Any) -> nocl.OCP:
     """Swing up from hanging at rest, x0 ~ N([0, 0, pi, 0], std^2 I), within `horizon` seconds; constants: system's."""
     return nocl.OCP.quadratic(
         system(**constants), horizon=horizon, R=R, P=P, x_goal=np.zeros(4), u_goal=[0.0],

@@ -196,7 +196,8 @@ class Goals(table.PaperTable[Plan, Cell, Entry]):
         cnd = train(ocp, model, seed=place.seed, settings=TrainSettings.of(effort, value=False), progress=False)
         seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
         gap, collisions = judged(ocp, cnd, plan.n, place.seed)
-        return Cell(*place, self.key(plan, place), gap.tolist(), collisions, identified, seconds, cpu)
+        return Cell(place.problem, place.way, place.seed, self.key(plan, place), gap.tolist(), collisions, identified,
+                    seconds, cpu)
 
     def entries(self, cells: Sequence[Cell]) -> list[Entry]:
         groups = [(problem, way, [c for c in cells if (c.problem, c.way) == (problem, way)])

@@ -69,9 +69,10 @@ class Lifted:
         at = self.of.functions.feedback()
         z = ca.vertcat(at["x"], *[at["t"]] * len(self.clock), *([at["p"]] if self.of.np else []))
         phi = net.inputs(*[z, at["t"]][:net.inputs.n_in()])
-        y = ca.SX.sym("y", net.nets[0].sizes[-1])
+        layers = cast(MLP, net.nets[0])
+        y = ca.SX.sym("y", layers.sizes[-1])
         out = net.outputs(*[z, at["t"]][:net.outputs.n_in() - 1], y)
-        return FeatureNet(at.function(net.inputs.name(), {net.inputs.name_out(0): phi}), [cast(MLP, net.nets[0])],
+        return FeatureNet(at.function(net.inputs.name(), {net.inputs.name_out(0): phi}), [layers],
                           at.function(net.outputs.name(), {net.outputs.name_out(0): out}, y=y))
 
 
