@@ -25,6 +25,7 @@ from typing import Any
 import casadi as ca
 
 from nocl.parameters import TIME, time
+from nocl.support import checks
 from nocl.system import System
 from nocl.translate.arguments import Arguments
 from nocl.translate.rk4 import rk4_cost
@@ -90,6 +91,13 @@ class Functions:
         """(x, t[, p]), new symbols of a kind, ca.SX or ca.MX: what policies and values are functions of."""
         p = {"p": self.np} if self.np else {}
         return Arguments.new(kind, x=self.system.nx, t=1, **p)
+
+    def of_feedback(self, name: str, column: ca.SX) -> ca.Function:
+        """(x, t[, p]) -> an expression in the system's and the problem's own symbols; ValueError for others."""
+        own = {"x": self.system.x, "t": time(), "p": ca.vertcat(self.system.p, self.p)}
+        checks.expression(column, column.numel(), ca.vertcat(own["x"], own["p"]), name, self.system.name, time=time())
+        names = self.feedback().names
+        return ca.Function(name, [own[n] for n in names], [column], names, [name])
 
     @cached_property
     def f(self) -> ca.Function:

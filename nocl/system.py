@@ -223,6 +223,11 @@ class System:
         xdot = None if self.xdot is None else ca.substitute(self.xdot, self.p, ca.DM(value))
         return replace(self, xdot=xdot, p=None, units=units)
 
+    def with_inputs(self, low: Array, high: Array) -> System:
+        """f(x, u, p) as f(x, (u, p)): the parameters after the controls, between low and high [np]."""
+        return replace(self, u=ca.vertcat(self.u, self.p), p=None, lbu=np.r_[self.lbu, low],
+                       ubu=np.r_[self.ubu, high])
+
     def difference(self, other: System, equations: bool = True) -> str:
         """What tells another system from this one, names of states and controls or (where asked) parameters and
         equations; "" where they are the same."""

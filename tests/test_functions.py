@@ -20,6 +20,7 @@ DOOR = {  # files that may hold the symbols of a system and the expressions of a
     "nocl/system.py",  # where f is written
     "nocl/ocp.py",  # where L, G and h are
     "nocl/functions.py",  # the door
+    "solvers/cnd/lifted.py",  # where a problem is written anew, p and t among its states
 }
 SYSTEM = {"x", "u", "p", "xdot"}  # what only they read of a System ...
 OCP = {"running", "terminal"}  # ... and of an OCP

@@ -66,10 +66,10 @@ def _quadrotor() -> OCP:
     """From rest anywhere in a box of 4 m to rest anywhere in it."""
     bounds: Bounds = dict.fromkeys(("goal_x", "goal_y", "goal_z"), (-2.0, 2.0))
     goal, system = ca.vertcat(*_symbols(bounds, dict.fromkeys(bounds, "m")).values()), quadrotor.system()
-    weight = float(-system.f(np.zeros(12), np.zeros(4))[8])
     half = np.r_[np.full(3, 2.0), np.zeros(9)]
-    return OCP.quadratic(system, p=goal, horizon=4.0, x_goal=ca.vertcat(goal, np.zeros(9)), u_goal=[weight, 0, 0, 0],
-                         initial_states=nocl.Uniform(-half, half), parameters=_within(bounds))
+    return OCP.quadratic(system, p=goal, horizon=4.0, x_goal=ca.vertcat(goal, np.zeros(9)),
+                         u_goal=quadrotor.ocp().u_goal, initial_states=nocl.Uniform(-half, half),
+                         parameters=_within(bounds))
 
 
 def _acrobot() -> OCP:

@@ -25,11 +25,7 @@ MIN_ROWS = 2048  # of labels, however many labels of f one takes
 
 def widened(system: System, parameters: Distribution | None) -> System:
     """The system with its parameters after its controls, in the box of their distribution; itself where it has none."""
-    if parameters is None:
-        return system
-    low, high = open_box(parameters)
-    return replace(system, u=ca.vertcat(system.u, system.p), p=None, lbu=np.r_[system.lbu, low],
-                   ubu=np.r_[system.ubu, high])
+    return system if parameters is None else system.with_inputs(*open_box(parameters))
 
 
 def box_of(system: System) -> Variables:

@@ -16,7 +16,6 @@ import numpy as np
 
 from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
-from nocl.parameters import time
 from nocl.scales import usual_sizes
 from nocl.support import checks
 from nocl.support.checks import Array
@@ -49,14 +48,12 @@ def own_features(ocp: OCP, given: Any) -> ca.Function | None:
     """
     if given is None:
         return None
-    at, owner = ocp.functions.feedback(), f"train({ocp.system.name}): features"
+    owner = f"train({ocp.system.name}): features"
     column = checks.column(given)
     if not isinstance(column, ca.SX) or not column.numel():
         raise ValueError(f"{owner} is {checks.shown(given)}; expected SX expressions in the states, parameters and "
                          "nocl.time(), like [ca.sin(x[0] - goal)]")
-    s, known = ocp.system, {"x": ocp.system.x, "t": time(), "p": ca.vertcat(ocp.system.p, ocp.p)}
-    checks.expression(column, column.numel(), ca.vertcat(s.x, known["p"]), "features", f"train({s.name})", time=time())
-    own = ca.Function("own", [known[name] for name in at.names], [column], at.names, ["own"])
+    own = ocp.functions.of_feedback("features", column)
     _check_images(ocp, own, owner)
     return own
 
