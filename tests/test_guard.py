@@ -111,6 +111,23 @@ def test_threads_get_their_own_answers():
     assert len(guard._COPIES) == 1  # those of the threads went with them
 
 
+def test_a_copy_is_ended_while_another_thread_asks_whether_it_lives(monkeypatch):
+    """Its pipe is closed, so it ends by itself too; where somebody waits for it before the kill, its number is gone."""
+    Guarded(twice)(60.0, 0)
+    copy, kill = guard._COPIES[-1], os.kill
+
+    def later(pid, number):
+        time.sleep(0.2)
+        other = threading.Thread(target=copy.lives)
+        other.start()
+        time.sleep(0.2)
+        kill(pid, number)
+
+    monkeypatch.setattr(guard.os, "kill", later)
+    copy.end()
+    assert not copy.lives()
+
+
 def test_a_copy_that_inherits_a_locked_lock_is_made_anew():
     """As a fork beside threads may, which catches one of them inside a library."""
     lock = threading.Lock()

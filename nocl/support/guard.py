@@ -60,6 +60,7 @@ class _Copy:
     def __init__(self) -> None:
         self.owner = os.getpid()
         self.status: int | None = None  # once it has ended
+        self.waiting = threading.Lock()  # held by who waits for it or ends it: any thread may ask whether it lives
         self.pipe, theirs = Pipe()
         with _LOCK:  # nobody registers a function meanwhile
             self.newest = max(_FUNCTIONS, default=-1)
@@ -71,6 +72,10 @@ class _Copy:
 
     def lives(self) -> bool:
         """It has not ended."""
+        with self.waiting:
+            return self._lives()
+
+    def _lives(self) -> bool:
         if self.status is None:
             self._wait(os.WNOHANG)
         return self.status is None
@@ -103,9 +108,10 @@ class _Copy:
         if self.owner != os.getpid():
             return ""
         self.pipe.close()
-        if self.lives():
-            os.kill(self.pid, signal.SIGKILL)
-            self._wait()
+        with self.waiting:  # its number is its own until somebody has waited for it
+            if self._lives():
+                os.kill(self.pid, signal.SIGKILL)
+                self._wait()
         status = self.status or 0
         return signal.Signals(-status).name if status < 0 else f"exit code {status}"
 
