@@ -71,7 +71,8 @@ def off(got: Any, approx: Any) -> float:
 
 
 def numbers(value: Any) -> Any:
-    return np.asarray(value.detach() if isinstance(value, torch.Tensor) else value, float)
+    array = np.asarray(value.detach() if isinstance(value, torch.Tensor) else value)
+    return array if np.iscomplexobj(array) else array.astype(float)
 
 
 RULES: dict[str, tuple[Callable[[Any, Any], Any], Callable[[Any, Any], float]]] = {
