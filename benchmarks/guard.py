@@ -24,9 +24,10 @@ from nocl.support.checks import Array
 PATH = provenance.RESULTS / "guard.json"
 
 
-def here(self: Transcription, x0: Array, t: Array, x: Array, u: Array, time_limit: float | None = None) -> Answer:
+def here(self: Transcription, x0: Array, t: Array, x: Array, u: Array, time_limit: float | None = None,
+         p: Array | None = None) -> Answer:
     """A solve in this process."""
-    return self._solve(x0, t, x, u)
+    return self._solve(x0, t, x, u, np.zeros(0) if p is None else p)
 
 
 def seconds(nmpc: NMPC, x0: Array) -> float:
