@@ -95,7 +95,7 @@ class Uniform:
 
 
 Distribution = Gaussian | Uniform
-STILL = 1e-2
+STILL = 1e-2  # how far to either side of a fixed coordinate, relative
 BULK = 4.0  # standard deviations: one normal number in 16,000 is further from the mean
 
 

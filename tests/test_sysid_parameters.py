@@ -116,6 +116,10 @@ def test_refusals():
         nocl.identify(s, parameters=WHERE, control_affine=True)
     with pytest.raises(ValueError, match="p is missing; expected values of mass, drag"):
         nocl.Log.of(s, np.arange(9.0), np.zeros((9, 2)), np.zeros((9, 1)))
+    net = nocl.identify(s.at([1.0, 0.1]), settings=QUICK, progress=False).net
+    for ask in (nocl.LearnedDynamics.score, nocl.LearnedDynamics.plot):
+        with pytest.raises(ValueError, match="where mass, drag lie is not known"):
+            ask(nocl.LearnedDynamics(s, net, "by hand"))
     timed = nocl.System("timed", x=s.x, u=s.u, p=s.p, xdot=ca.vertcat(s.x[1], s.u + s.p[0] * nocl.time()),
                         lbu=[-1], ubu=[1], lbx=[-1, -1], ubx=[1, 1])
     with pytest.raises(ValueError, match="f holds the time"):

@@ -94,6 +94,9 @@ class LearnedDynamics:
         s = self.system
         if not s.np:
             return self
+        if self.parameters is None:
+            raise ValueError(f"LearnedDynamics of {s.name!r}: where {', '.join(s.parameter_names)} lie is not known; "
+                             "expected it with parameters=nocl.Uniform(lb, ub)")
         return replace(self, system=widened(s, self.parameters), net=together(self.net, s), parameters=None)
 
     def _of(self, plant: System, parameters: Distribution | None) -> LearnedDynamics:

@@ -30,10 +30,10 @@ class Lifted:
         self.of, s = ocp, ocp.system
         self.clock = [ca.SX.sym("clock")] if ocp.uses_time else []
         self.p = ca.vertcat(s.p, ocp.p)
-        self.ocp = OCP(
-            self._system(), horizon=ocp.horizon, running=self._at(ocp.running), terminal=self._at(ocp.terminal),
-            x_goal=[*ocp.x_goal, *[ocp.horizon] * len(self.clock), *ocp.nominal], u_goal=ocp.u_goal,
-            initial_states=self._box(), penalty=ocp.penalty, penalty_margin=ocp.penalty_margin,
+        self.ocp = replace(
+            ocp, system=self._system(), running=self._at(ocp.running), terminal=self._at(ocp.terminal),
+            x_goal=[*ocp.x_goal, *[ocp.horizon] * len(self.clock), *ocp.nominal], u_goal=np.array(ocp.u_goal),
+            initial_states=self._box(), p=None, parameters=None,
             path_constraints={name: self._at(h) for name, h in ocp.path_constraints.items()})
 
     def _at(self, expression: ca.SX) -> ca.SX:
@@ -61,7 +61,7 @@ class Lifted:
         return np.hstack([x, np.zeros((n, len(self.clock))), p])
 
     def dynamics(self, f: Any) -> Any:
-        """Learned dynamics (x, u[, t][, p of the system]) -> xdot as those of z; None for the exact ones."""
+        """Learned dynamics (x, u[, p of the system]) -> xdot as those of z; None for the exact ones."""
         return None if f is None else LiftedDynamics(self.of, getattr(f, "net", f))
 
     def lowered(self, net: FeatureNet) -> FeatureNet:

@@ -114,17 +114,15 @@ def train_paper(ocp: OCP, dynamics: Any = None, settings: PaperSettings | None =
     Raises ValueError where training diverges, naming the iteration and what to try.
     """
     settings = settings or PaperSettings()
-    if ocp.np or ocp.uses_time:
-        of = Lifted(ocp)
-        trainer = Trainer(of.ocp, of.dynamics(dynamics), settings, seed, progress, device, dtype, of.sample)
-    else:
-        trainer = Trainer(ocp, dynamics, settings, seed, progress, device, dtype)
+    of = Lifted(ocp) if ocp.np or ocp.uses_time else None
+    trainer = Trainer(ocp, dynamics, settings, seed, progress, device, dtype) if of is None else \
+        Trainer(of.ocp, of.dynamics(dynamics), settings, seed, progress, device, dtype, of.sample)
     named = f"{type(dynamics)}{getattr(dynamics, '__qualname__', '')}"  # of a plain callable its name alone is known
     key = identity(ocp, settings, seed, trainer.f, dtype=str(dtype), dynamics=named)
     run = _Training.resumed(trainer, checkpoint, key) or _Training.raced(trainer)
     run.train(callback, None if checkpoint is None else lambda: run.save(checkpoint, key))
     policy, value = run.best.networks(settings)
-    if ocp.np or ocp.uses_time:
+    if of is not None:
         policy, value = of.lowered(policy), of.lowered(value)
     card = {"method": "paper", "settings": asdict(settings), "seed": seed, "dtype": str(dtype).removeprefix("torch."),
             "dynamics": "exact" if dynamics is None else "learned", "race": run.race, "race_seconds": run.race_seconds,
