@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from nocl.ocp import OCP
-from nocl.parameters import parameter, time
+from nocl.parameters import parameter, spline, time
 from nocl.sampling import Gaussian, Uniform
 from nocl.smoothness import smooth_abs, smooth_max, split_controls
 from nocl.support.lazy import hand_on
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = ["CND", "OCP", "Dataset", "Ensemble", "Gaussian", "LearnedDynamics", "Log", "Solution", "System",
            "Trajectory", "Uniform", "comparisons", "held_inputs", "identify", "load_ocp", "parameter", "pretrained",
-           "simulate", "smooth_abs", "smooth_max", "solvers", "split_controls", "systems", "time", "to_acados",
+           "simulate", "smooth_abs", "smooth_max", "solvers", "spline", "split_controls", "systems", "time", "to_acados",
            "to_casadi", "to_control", "to_do_mpc", "to_gymnasium", "to_torch", "train"]
 
 _LAZY = {  # public name -> module: torch and the solvers are imported when first used

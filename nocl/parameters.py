@@ -56,6 +56,32 @@ def time() -> ca.SX:
     return ca.SX(_time)
 
 
+def spline(t: Any, times: Any, values: Any) -> ca.SX:
+    """The cubic spline through `values` [n] at `times` [n], n >= 2, as an SX expression in t: a reference from samples.
+
+    values : numbers, or SX expressions such as parameters, which it is linear in; t : nocl.time(), or any expression
+
+    Its second derivative is continuous, the third one also at the second and the last but one of `times` (not-a-knot);
+    before the first and after the last time the outermost cubic goes on. Raises ValueError for times that do not rise.
+    """
+    from scipy.interpolate import CubicSpline  # which takes longer to import than all of nocl
+
+    nodes, column = checks.numeric(times, "times", "spline", "rising numbers [n]"), checks.column(values)
+    if nodes.ndim != 1 or len(nodes) < 2 or not (np.isfinite(nodes).all() and (np.diff(nodes) > 0).all()):
+        raise ValueError(f"spline: times is {checks.shown(times)}; expected at least two finite numbers that rise")
+    if not isinstance(column, (ca.SX, ca.DM)):
+        column = ca.DM(checks.vector(values, len(nodes), "values", "spline"))
+    if column.shape != (len(nodes), 1):
+        raise ValueError(f"spline: values has shape {column.shape}; expected one for each of the {len(nodes)} times")
+    span = nodes[-1] - nodes[0]
+    s, knots = (t - nodes[0]) / span, (nodes - nodes[0]) / span
+    cubic, square, slope, start = (ca.DM(c) @ column for c in CubicSpline(knots, np.eye(len(nodes))).c)
+    value = start[0] + s * (slope[0] + s * (square[0] + s * cubic[0]))
+    for i in range(1, len(nodes) - 1):
+        value += (cubic[i] - cubic[i - 1]) * ca.fmax(s - knots[i], 0) ** 3
+    return ca.SX(value)
+
+
 def nominal_of(p: ca.SX) -> Array:
     """The nominal values of a column of parameters [np], NaN where none was given."""
     given = [_known.get(s.element_hash()) for s in ca.vertsplit(p)]

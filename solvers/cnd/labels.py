@@ -13,13 +13,15 @@ from torch import Tensor
 
 from nocl.data import Solution
 from nocl.ocp import OCP
+from nocl.sampling import Uniform, box
 from nocl.solvers.cnd.in_torch import InTorch
-from nocl.solvers.ddp.bank import SolutionBank, better
+from nocl.solvers.ddp.bank import Rows, SolutionBank, better
 from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
 from nocl.translate.rk4 import rk4
 
 Policy = Callable[..., Tensor]  # (x, t[, p]) -> u
+NEAR = 0.1  # how near hard problems more are drawn
 SMALL = 0.1  # of a usual cost: what is added to costs before anything is divided by them
 COARSE = (2, 5, 10, 20, 40, 160, 640)  # intervals of tails that are solved for other control rates than the labels'
 LONGEST = 40  # a control is held for the horizon over LONGEST at most
@@ -107,6 +109,9 @@ class Problems:
     def __len__(self) -> int:
         return len(self.t)
 
+    def __getitem__(self, rows: Rows) -> Problems:
+        return Problems(self.x[rows], self.t[rows], self.p[rows])
+
     @property
     def given_p(self) -> Array | None:
         """As solvers take p."""
@@ -136,18 +141,36 @@ def tube_states(ocp: OCP, bank: SolutionBank, n: int, width: float,
     return rows, Problems(x, t0, p)
 
 
+def near(ocp: OCP, at: Problems, n: int, rng: np.random.Generator) -> Problems:
+    """n problems near some of initial states, NEAR of half the width of where x0 and p lie away."""
+    rows = rng.integers(0, len(at), n)
+
+    def about(values: Array, low: Array, high: Array) -> Array:
+        return values[rows] + NEAR * (high - low) / 2 * rng.standard_normal((n, len(low)))
+
+    x, p = about(at.x, *box(ocp.initial_states)), about(at.p, *ocp.parameter_box)
+    if isinstance(ocp.initial_states, Uniform):
+        x = np.clip(x, *box(ocp.initial_states))
+    return Problems(x, at.t[rows], np.clip(p, *ocp.parameter_box))
+
+
 def visited(ddp: DDP, bank: SolutionBank, policy: Policy, torch_ocp: InTorch, n: int, kick: float,
-            rng: np.random.Generator) -> Solution:
-    """Tails from n states that the policy visits under kicks."""
+            rng: np.random.Generator, around: Problems | None = None) -> Solution:
+    """Tails from n states that the policy visits under kicks; `around` as in kicked_states."""
     return answered(ddp, bank, policy, torch_ocp,
-                    kicked_states(bank, policy, torch_ocp, n, kick, rng, ddp.substeps))
+                    kicked_states(bank, policy, torch_ocp, n, kick, rng, ddp.substeps, around))
 
 
 def kicked_states(bank: SolutionBank, policy: Policy, torch_ocp: InTorch, n: int, kick: float,
-                  rng: np.random.Generator, substeps: int = 1) -> Problems:
-    """n states, or fewer, that the policy visits under kicks, at any time: those not far out of the box."""
+                  rng: np.random.Generator, substeps: int = 1, around: Problems | None = None) -> Problems:
+    """n states, or fewer, that the policy visits under kicks, at any time: those not far out of the box.
+
+    around : problems near which half of the starts are drawn
+    """
     ocp = torch_ocp.ocp
     start = Problems.initial(ocp, max(n // (2 if ocp.np else 8), 1), rng)
+    if around is not None:
+        start = Problems.join([start, near(ocp, around, len(start), rng)])
     t, x = kicked_rollout(torch_ocp, policy, start, kick * bank.scale[:ocp.system.nx], rng, substeps=substeps)
     rows, k = rng.integers(0, len(x), n), rng.integers(0, len(t) - 1, n)
     found = Problems(x[rows, k], t[k], start.p[rows])

@@ -36,7 +36,7 @@ from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.features import at_rate, own_features, policy_net
 from nocl.solvers.cnd.identity import identity
 from nocl.solvers.cnd.in_torch import InTorch
-from nocl.solvers.cnd.labels import Labels, Problems, at_other_rates, tube, visited
+from nocl.solvers.cnd.labels import Labels, Problems, answered, at_other_rates, tube, visited
 from nocl.solvers.cnd.paper import PaperSettings, train_paper
 from nocl.solvers.cnd.regress import fit_net, policy_loss
 from nocl.solvers.cnd.settings import TrainSettings
@@ -69,6 +69,7 @@ __all__ = ["TrainSettings", "train"]
 CHECKPOINT = "training.safetensors"
 VALUE_LARGE = 0.05  # mean |V - J*| / J* that a warning is given above
 VALUE_HELD_OUT = 16  # times held_out: a mean of relative errors hangs on the few states that are hard
+HARD = 4  # times held_out: fresh problems of which the hardest eighth is looked at in each round, where there are parameters
 LOSSES = 40  # of each regression that the card keeps
 
 
@@ -214,9 +215,23 @@ class Training:
     def _visit(self) -> None:
         s, rng = self.settings, self._rng(self.round)
         with self._stage(f"round {self.round}: visited states", 1) as bar:
-            solved = visited(self.ddp, self.bank, self.policy, self.in_torch, s.visits, s.kick, rng)
+            around = self._hardest(rng) if self.ocp.np else None
+            solved = visited(self.ddp, self.bank, self.policy, self.in_torch, s.visits, s.kick, rng, around)
             self.labels = Labels.join([self.labels, self._labels(solved, rng)])
             bar.update()
+
+    def _hardest(self, rng: np.random.Generator) -> Problems:
+        """The fresh problems that the controller is worst at, solved from cold starts: what they tell joins the labels
+        and the bank."""
+        s = self.settings
+        fresh = Problems.initial(self.ocp, HARD * s.held_out, rng)
+        best = answered(self.ddp, self.bank, self.policy, self.in_torch, fresh)
+        lost = np.nan_to_num(gap(self.policy, self.in_torch, best, substeps=self.substeps), nan=np.inf)
+        worst = fresh[np.argsort(-np.abs(lost), kind="stable")[:s.held_out // 2]]
+        solved = solve_globally(self.ddp, worst.x, p=worst.given_p, starts=s.starts, seed=rng)
+        self.bank = self.bank.add(solved)
+        self.labels = Labels.join([self.labels, self._labels(solved, rng)])
+        return worst
 
     def _regress(self, iterations: int) -> None:
         s = self.settings
