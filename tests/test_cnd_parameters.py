@@ -1,5 +1,8 @@
 """One controller u(x, t, p) and one value V(x, t, p) for every goal and mass, against Riccati's at each."""
 
+import dataclasses
+import itertools
+
 import casadi as ca
 import lq
 import numpy as np
@@ -13,7 +16,8 @@ from nocl.solvers import DDP, NMPC
 from nocl.solvers.cnd import CND, TrainSettings
 from nocl.solvers.cnd.features import features
 from nocl.solvers.cnd.in_torch import InTorch
-from nocl.solvers.cnd.labels import Labels, Problems, kicked_states
+from nocl.solvers.cnd.labels import Labels, Problems, kicked_states, near
+from nocl.solvers.cnd.training import Training
 
 QUICK = TrainSettings(intervals=40, seeds=8, starts=2, states=100, tails=800, visits=300, rounds=0, iterations=1000,
                       batch=512, hidden=(32, 32), value_initial=200, value_tails=1000, value_visits=200,
@@ -171,6 +175,50 @@ def test_kicks_push_states_and_never_parameters():
     low, high = ocp.parameter_box
     assert ((found.p >= low) & (found.p <= high)).all()
     assert len(np.unique(found.p, axis=0)) > 16
+
+
+def test_more_are_drawn_near_the_problems_that_the_controller_is_worst_at():
+    """A policy that is right but where the goal is above 0.6: half of the starts lie there, all inside the box."""
+    ocp = mover()
+    training = Training(ocp, None, QUICK, 0, None, False)
+    training._first_labels()
+
+    def policy(x, t, p):
+        K = torch.from_numpy(lq_value([0.0])[1][0].reshape(1, 2))
+        right = -((x - torch.cat([p[:, 1:], 0 * t], dim=1)) * K).sum(dim=1, keepdim=True)
+        return torch.where(p[:, 1:] > 0.6, 0.0 * right, right)
+
+    training.policy, before = policy, len(training.labels)
+    hard = training._hardest(np.random.default_rng(1))
+    low, high = ocp.parameter_box
+    assert len(hard) == QUICK.held_out // 2
+    assert (hard.p[:, 1] > 0.6).mean() > 0.8
+    assert len(training.labels) == before + len(hard) * QUICK.intervals
+    more = near(ocp, hard, 500, np.random.default_rng(2))
+    assert ((more.p >= low) & (more.p <= high)).all()
+    assert (more.p[:, 1] > 0.4).mean() > 0.8
+    found = kicked_states(training.bank, policy, training.in_torch, 2000, 0.01, np.random.default_rng(3), around=hard)
+    assert (found.p[:, 1] > 0.5).mean() > 0.45
+
+
+def test_states_that_lie_in_a_box_stay_in_it():
+    ocp = dataclasses.replace(mover(), initial_states=nocl.Uniform([-1, -0.5], [1, 0.5]))
+    at = Problems(np.array([[1.0, 0.5]]), np.zeros(1), np.array([[1.0, 0.0]]))
+    found = near(ocp, at, 200, np.random.default_rng(0))
+    assert (np.abs(found.x) <= [1, 0.5]).all()
+    assert (found.x > [0.5, 0.25]).all()
+    assert found.x.std(axis=0).min() > 0.01
+
+
+def test_effort_grows_with_the_number_of_parameters():
+    sizes = [TrainSettings.of("normal", parameters=n) for n in (0, 1, 4, 8, 30)]
+    assert sizes[0] == TrainSettings()
+    for fewer, more in itertools.pairwise(sizes[:-1]):
+        assert all(getattr(more, name) > getattr(fewer, name) for name in TrainSettings.MORE)
+    assert sizes[-1] == sizes[-2]
+    assert TrainSettings.of("quick", parameters=3, tails=7).tails == 7
+    with pytest.raises(ValueError, match="parameters is -1"):
+        TrainSettings.of("normal", parameters=-1)
 
 
 def test_the_same_in_torch(trained):

@@ -52,7 +52,7 @@ def _symbols(bounds: Bounds, units: dict[str, str] | None = None) -> dict[str, c
     return {name: nocl.parameter(name, unit=(units or {}).get(name, "")) for name in bounds}
 
 
-def _cartpole(**plant: tuple[float, float]) -> OCP:
+def cartpole_problem(**plant: tuple[float, float]) -> OCP:
     """Swing up and stop at a goal; some constants of the plant vary too."""
     units = {"l": "m", "m_pole": "kg", "m_cart": "kg", "gain": "N", "friction": "N s/m"}
     constants, goal = _symbols(plant, units), nocl.parameter("goal", 0.0, "m")
@@ -106,8 +106,8 @@ POLE: Bounds = {"l": (0.7, 1.3), "m_pole": (0.07, 0.13)}
 CART: Bounds = {"m_cart": (0.7, 1.3), "gain": (2.1, 3.9), "friction": (0.0, 0.5)}
 PROBLEMS: dict[str, tuple[str, Callable[[], OCP]]] = {
     "cartpole-goal": ("cart-pole: goal", _cartpole),
-    "cartpole-pole": ("cart-pole: goal, length, pole's mass", lambda: _cartpole(**POLE)),
-    "cartpole-all": ("cart-pole: goal, length, both masses, gain, friction", lambda: _cartpole(**POLE, **CART)),
+    "cartpole-pole": ("cart-pole: goal, length, pole's mass", lambda: cartpole_problem(**POLE)),
+    "cartpole-all": ("cart-pole: goal, length, both masses, gain, friction", lambda: cartpole_problem(**POLE, **CART)),
     "quadrotor-goal": ("quadrotor: goal and start anywhere in a 4 m box", _quadrotor),
     "acrobot-goal": ("acrobot: angle of joint 2, both masses", _acrobot),
     "dubins-obstacle": ("dubins: obstacle, its radius, goal pose", _dubins),
@@ -193,7 +193,8 @@ class Goals(table.PaperTable[Plan, Cell, Entry]):
                          progress=False) if self.ways[place.way].learned else None
         identified = 0.0 if model is None else time.perf_counter() - start
         start, cpu = time.perf_counter(), time.process_time()
-        cnd = train(ocp, model, seed=place.seed, settings=TrainSettings.of(effort, value=False), progress=False)
+        settings = TrainSettings.of(effort, parameters=ocp.np, value=False)
+        cnd = train(ocp, model, seed=place.seed, settings=settings, progress=False)
         seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
         gap, collisions = judged(ocp, cnd, plan.n, place.seed)
         return Cell(place.problem, place.way, place.seed, self.key(plan, place), gap.tolist(), collisions, identified,

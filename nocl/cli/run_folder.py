@@ -121,7 +121,8 @@ class RunFolder:
         say(f"controller: training on {'the exact' if exact else 'learned'} dynamics" + _anew(there))
         start = time.perf_counter()
         checkpoint = self.folder / "checkpoint" / "cnd"
-        cnd = train(self.ocp, model, seed=self.seed, settings=TrainSettings.of(self.effort), out=checkpoint)
+        settings = TrainSettings.of(self.effort, parameters=self.ocp.np)
+        cnd = train(self.ocp, model, seed=self.seed, settings=settings, out=checkpoint)
         cnd.card[KEY] = made_from
         cnd.save(self.folder / "cnd")
         cnd.plot_training(self.folder / "cnd" / "training.png")

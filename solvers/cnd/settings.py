@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
 from nocl import hjb
 from nocl.nets import ACTIVATIONS
+from nocl.support import checks
 from nocl.support.fields import Checked, Scaled, choice, coefficients, count, flag, positive, widths
 from nocl.translate.rk4 import rk4_cost
 
@@ -26,6 +27,22 @@ class TrainSettings(Scaled):
                  "iterations": 3000, "hidden": (128, 128, 128), "value_initial": 3000, "value_tails": 12_000,
                  "value_visits": 6000, "value_iterations": 10_000, "value_error": 1e-3, "held_out": 128,
                  "gap_median": 5e-5, "gap_p95": 2.5e-4}}
+
+    # by how much more of each a problem with parameters takes, for each of them; MOST: as many parameters at most
+    MORE: ClassVar[Mapping[str, float]] = {"seeds": 1 / 2, "states": 1 / 2, "tails": 1 / 4, "visits": 1 / 4,
+                                           "iterations": 1 / 8, "hidden": 1 / 8}
+    MOST: ClassVar[int] = 8
+
+    @classmethod
+    def of(cls, effort: str, *, parameters: int = 0, **changes: Any) -> TrainSettings:
+        """The settings of an effort, "quick", "normal" or "best", with changes of single fields.
+
+        parameters : how many the problem has (OCP.np): the more, the more labels, the longer and wider the regression
+        """
+        n = min(checks.whole(parameters, "parameters", "TrainSettings.of", 0), cls.MOST)
+        usual = asdict(super().of(effort))
+        more = {name: _times(usual[name], 1 + n * share) for name, share in cls.MORE.items()} if n else {}
+        return cls(**{**usual, **more, **changes})
 
     intervals: int = count(80, "held controls of each labelled solution")
     substeps: int | None = count(None, "RK4 steps in each interval", none="as many as a few solutions ask for, held "
@@ -55,6 +72,11 @@ class TrainSettings(Scaled):
     held_out: int = count(64, "initial states that tell when to stop")
     gap_median: float = positive(2e-4, "stop once both are met: (J - J*) / J*, median over the held-out states")
     gap_p95: float = positive(1e-3, "and its 95th percentile")
+
+
+def _times(value: Any, factor: float) -> Any:
+    """A count that many times; widths of layers in steps of 8."""
+    return tuple(8 * round(w * factor / 8) for w in value) if isinstance(value, tuple) else round(value * factor)
 
 
 @dataclass(frozen=True)

@@ -86,6 +86,7 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
     method : "default" or "paper"
         "paper" is CND as published: HJB losses through ODE rollouts, see nocl.solvers.cnd.paper.
     settings : TrainSettings, or PaperSettings with method="paper"
+        Default: TrainSettings.of("normal", parameters=ocp.np).
     seed : int
         The same seed gives the same controller on the same machine.
     out : folder, optional
@@ -107,7 +108,8 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
         return CND(ocp, policy, value, card)
     ocp.check_strict("train")
     own = own_features(ocp, features)
-    return Training(ocp, dynamics, _expect(settings, TrainSettings), seed, out, progress, own).run()
+    chosen = _expect(settings or TrainSettings.of("normal", parameters=ocp.np), TrainSettings)
+    return Training(ocp, dynamics, chosen, seed, out, progress, own).run()
 
 
 def _check(ocp: OCP, dynamics: LearnedDynamics | None, seed: int, out: str | os.PathLike[str] | None) -> None:
