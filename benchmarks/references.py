@@ -7,7 +7,7 @@
 - preview: the policy of `samples` on 2.4 s, asked at t = 0 all the time, p the window r(now ... now + 2.4 s) of a long
   reference; against DDP solved anew for every step from the same window
 
-Gaps are to the optimum of many starts, under CVODES, on fresh (x0, p). Results go to benchmarks/results/references.json.
+Gaps are to the optimum of many starts, under CVODES, on fresh (x0, p). Results: benchmarks/results/references.json.
 """
 
 from __future__ import annotations

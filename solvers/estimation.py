@@ -143,8 +143,9 @@ class Adaptive:
         else:
             before, u, when = self._last
             if abs(t - when - of.dt) > SAME_TIME * of.dt:
-                raise ValueError(f"Adaptive: asked at t = {t:g}, {t - when:g} after the last time; the estimator's dt is "
-                                 f"{of.dt:g}: give simulate hold={of.ocp.horizon / of.dt:.4g}, or the estimator that dt")
+                raise ValueError(f"Adaptive: asked at t = {t:g}, {t - when:g} after the last time; the estimator's dt "
+                                 f"is {of.dt:g}: give simulate hold={of.ocp.horizon / of.dt:.4g}, or the estimator "
+                                 "that dt")
             self.estimates.append(of.update(self.estimates[-1], before, u, x, when))
         known = np.concatenate([self.estimates[-1].p, p[:, of.ocp.system.np:]], axis=1)
         u = np.clip(np.asarray(self.law(x, t, known)), of.ocp.system.lbu, of.ocp.system.ubu)

@@ -105,7 +105,7 @@ def _pendulum() -> OCP:
 POLE: Bounds = {"l": (0.7, 1.3), "m_pole": (0.07, 0.13)}
 CART: Bounds = {"m_cart": (0.7, 1.3), "gain": (2.1, 3.9), "friction": (0.0, 0.5)}
 PROBLEMS: dict[str, tuple[str, Callable[[], OCP]]] = {
-    "cartpole-goal": ("cart-pole: goal", _cartpole),
+    "cartpole-goal": ("cart-pole: goal", cartpole_problem),
     "cartpole-pole": ("cart-pole: goal, length, pole's mass", lambda: cartpole_problem(**POLE)),
     "cartpole-all": ("cart-pole: goal, length, both masses, gain, friction", lambda: cartpole_problem(**POLE, **CART)),
     "quadrotor-goal": ("quadrotor: goal and start anywhere in a 4 m box", _quadrotor),

@@ -69,7 +69,7 @@ __all__ = ["TrainSettings", "train"]
 CHECKPOINT = "training.safetensors"
 VALUE_LARGE = 0.05  # mean |V - J*| / J* that a warning is given above
 VALUE_HELD_OUT = 16  # times held_out: a mean of relative errors hangs on the few states that are hard
-HARD = 4  # times held_out: fresh problems of which the hardest eighth is looked at in each round, where there are parameters
+HARD = 4  # times held_out: fresh problems with parameters, the hardest eighth of which each round looks at
 LOSSES = 40  # of each regression that the card keeps
 
 
