@@ -96,8 +96,8 @@ def test_ddp_takes_the_same_steps_in_other_units(k, unit_u, unit_x):
 
 
 def test_what_counts_as_the_same_cost_does_not_depend_on_its_unit():
-    x0 = np.random.default_rng(0).normal([3.0, 0.0], [0.5, 1.0], (6, 2))
-    found = [solve_globally(DDP(swing(k), intervals=30), x0, starts=6, rounds=1, seed=0) for k in (1.0, 2.0**-40)]
+    x0 = np.random.default_rng(0).normal([3.0, 0.0], [0.5, 1.0], (16, 2))
+    found = [solve_globally(DDP(swing(k), intervals=30), x0, starts=8, rounds=1, seed=0) for k in (1.0, 2.0**-40)]
     np.testing.assert_array_equal(found[1].hits, found[0].hits)
     assert [len(o) for o in found[1].optima] == [len(o) for o in found[0].optima]
     assert max(len(o) for o in found[0].optima) > 1

@@ -98,7 +98,7 @@ def test_a_log_has_parameters_as_columns(tmp_path):
     model = nocl.identify(s, data=log, parameters=WHERE, known={"pos": "v"}, settings=quick, progress=False)
     assert model.to_casadi().name_in() == ["x", "u", "p"]
     seen = model.validate(log, (1, 10))
-    assert (seen.relative < 0.05 * seen.still_relative).all()
+    assert (seen.relative < 0.2 * seen.still_relative).all()
     a = np.array(rows)
     again = nocl.Log.of(s, a[:, 1], a[:, 2:4], a[:, 4:5], p={"mass": a[:, 5], "drag": a[:, 6]}, run=a[:, 0].astype(int))
     assert all((one.u == other.u).all() for one, other in zip(log, again, strict=True))

@@ -170,7 +170,7 @@ def expressions(draw: st.DrawFn, leaves: list[ca.SX], depth: int = 3) -> ca.SX:
 def test_random_expressions(data: st.DataObject, n: int, seed: int) -> None:
     z = ca.SX.sym("z", n)
     expression = ca.vertcat(*(data.draw(expressions(ca.vertsplit(z))) for _ in range(2)))
-    same_as_casadi(expression, z, np.random.default_rng(seed).uniform(-2, 2, (5, n)))
+    same_as_casadi(expression, z, np.random.default_rng(seed).uniform(-2, 2, (5, n)), 1e-10)  # curvatures lose digits
 
 
 def pendulum(nx: int = 2, nu: int = 1) -> ca.Function:
