@@ -64,15 +64,16 @@ class Disturbances:
 
 def robustness(ocp: OCP, methods: Mapping[str, Any], x0: ArrayLike, variants: Mapping[str, Any] | None = None,
                settings: Disturbances | None = None, workers: int | str = 1,
-               out: str | os.PathLike[str] | None = None, progress: bool | None = None) -> Robustness:
+               out: str | os.PathLike[str] | None = None, progress: bool | None = None, p: Any = None) -> Robustness:
     """Judge `methods`, as compare takes them, from states x0 [B, nx] under each disturbance.
 
+    p : parameters, where the problem has them: [np] for all, [B, np], or by name (OCP.parameters_of)
     variants : plants by name that the methods do not know, {"mass +20 %": system}: a System, an OCP (its system
         counts), a casadi.Function (x, u) -> xdot, or an object with `to_casadi()`
     """
-    ocp.refuse_parameters("robustness")
     rows, _ = checks.states(x0, ocp.system.nx, ocp.system.name)
-    return _Study(ocp, checked(methods), rows.copy(), settings or Disturbances(), workers,
+    starts = Starts(rows.copy(), ocp.parameters_of(p, len(rows), "robustness"))
+    return _Study(ocp, checked(methods), starts, settings or Disturbances(), workers,
                   None if out is None else Path(out), progress).run(variants or {})
 
 
@@ -83,8 +84,9 @@ def plant(ocp: OCP, variant: Any) -> ca.Function:
 
 
 def on_plant(ocp: OCP, f: ca.Function) -> OCP:
-    """The problem with another f: cost, goal and constraints stay."""
-    return replace(ocp, system=ocp.system.under(f))
+    """The problem with another f, as `plant` gives it: cost, goal and constraints stay."""
+    own, xdot = ocp.system.arguments, f(*ocp.functions.arguments.inputs)
+    return replace(ocp, system=ocp.system.under(own.function(f.name(), {"xdot": xdot})))
 
 
 def _spread(value: Any, nx: int, name: str) -> Array:
@@ -101,11 +103,10 @@ def _spread(value: Any, nx: int, name: str) -> Array:
 class _Study:
     """One call of robustness."""
 
-    def __init__(self, ocp: OCP, methods: Mapping[str, Any], x0: Array, settings: Disturbances, workers: int | str,
-                 out: Path | None, progress: bool | None) -> None:
-        self.ocp, self.x0, self.settings, self.workers, self.out = ocp, x0, settings, workers, out
-        self.progress = progress
-        self.starts = Starts(x0, np.zeros((len(x0), 0)))
+    def __init__(self, ocp: OCP, methods: Mapping[str, Any], starts: Starts, settings: Disturbances,
+                 workers: int | str, out: Path | None, progress: bool | None) -> None:
+        self.ocp, self.starts, self.settings, self.workers, self.out = ocp, starts, settings, workers, out
+        self.progress, self.x0, self.p = progress, starts.x, starts.p if ocp.np else None
         self.runs = runs_of(ocp, methods, self.starts, (None,), Solving(workers, out, progress))
         rate = settings.hold
         self.held = [run if run.solved is not None else replace(
@@ -113,7 +114,7 @@ class _Study:
         nx, rng = ocp.system.nx, np.random.default_rng(settings.seed)
         self.noise, sigma = (_spread(getattr(settings, name), nx, name) for name in ("noise", "kick"))
         slots = np.sort(rng.choice(np.arange(1, SLOTS - 1), settings.kicks, replace=False))
-        self.kicks = [(int(slot), sigma * rng.standard_normal(x0.shape)) for slot in slots]
+        self.kicks = [(int(slot), sigma * rng.standard_normal(self.x0.shape)) for slot in slots]
 
     def run(self, variants: Mapping[str, Any]) -> Robustness:
         plants = {name: plant(self.ocp, variant) for name, variant in variants.items()}  # checked before any work
@@ -121,8 +122,8 @@ class _Study:
         calm = self.judged("undisturbed", self.runs)
         guesses = [j.simulation.u[:, :-1] for j in calm]
         ddp = DDP(self.ocp, constraints="soft")
-        cold = solve_globally(ddp, self.x0, starts=STARTS, seed=99, progress=self.progress).u
-        best = Reference(self.ocp, FINE, [cold, *guesses]).solve(self.x0)
+        cold = solve_globally(ddp, self.x0, p=self.p, starts=STARTS, seed=99, progress=self.progress).u
+        best = Reference(self.ocp, FINE, [cold, *guesses]).solve(self.x0, self.p)
         J = best.cost
         found = [self.scenario("undisturbed", "No disturbance.", self.runs, calm, J)]
         found.append(self.play("noise", f"Each controller reads the state with noise of {_text(s.noise)} (standard "
@@ -150,11 +151,11 @@ class _Study:
     def anew(self, f: ca.Function, u: Array, guesses: Sequence[Array]) -> Array:
         """Cost [B] of the optimum on another plant, from what is known of the first one; judged, without penalty."""
         other = on_plant(self.ocp, f)
-        found = Reference(other, FINE, [u, *guesses]).solve(self.x0)
+        found = Reference(other, FINE, [u, *guesses]).solve(self.x0, self.p)
         cost = np.full(len(self.x0), np.inf)
         ok = np.flatnonzero(found.success)
         if ok.size:
-            cost[ok] = simulate(other, found.u[ok], self.x0[ok]).cost
+            cost[ok] = simulate(other, found.u[ok], self.x0[ok], p=None if self.p is None else self.p[ok]).cost
         return cost
 
     def real_time(self, calm: Sequence[Judgement], best: Array) -> Scenario:
@@ -206,7 +207,7 @@ def mass_variants(ocp: OCP, share: float = 0.2) -> dict[str, System]:
 
     Every mass is scaled alike; where a system has none, every constant but gravity and bounds is.
     """
-    if ocp.system.name not in NAMES:
+    if ocp.system.name not in NAMES or ocp.system.np:
         return {}
     make = import_module(f"nocl.systems.{ocp.system.name}").system
     constants = {name: p.default for name, p in inspect.signature(make).parameters.items()}

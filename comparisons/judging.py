@@ -23,6 +23,7 @@ from nocl.solvers.nmpc.loop import Loop
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
 from nocl.support.pool import Journal, Pool, do
+from nocl.translate.arguments import Arguments
 
 CALLS = 20  # control evaluations that are timed at each initial state, at most; the median counts
 TIMED = 100.0  # milliseconds spent on that, about
@@ -127,8 +128,11 @@ class Judging:
             ocp, _, controller = laws.at(self.starts.p[row])
         except Exception as error:  # whatever it raises at this p
             return _unknown(failed(self.ocp, [said(error)], self._nodes(run.hold or 80)))
-        job = replace(self, ocp=ocp, starts=Starts(self.starts.x[[row]], np.zeros((1, 0))))
-        return job.judge(replace(run, controller=controller), np.zeros(1, dtype=np.int64), delay)
+        f = self.disturbance.f
+        plant = None if f is None else _folded(f, ocp, self.starts.p[row])
+        job = replace(self, ocp=ocp, starts=Starts(self.starts.x, np.zeros((len(self.starts), 0))),
+                      disturbance=replace(self.disturbance, f=plant))
+        return job.judge(replace(run, controller=controller), np.array([row]), delay)
 
     def _nodes(self, K: int) -> Array:
         return np.linspace(0.0, self.ocp.horizon, K + 1)
@@ -202,17 +206,23 @@ def key_of(job: Judging) -> str:
                        version("casadi"))
 
 
+def _folded(f: ca.Function, ocp: OCP, p: Array) -> ca.Function:
+    """A plant of a problem with parameters, on the problem at p."""
+    at = Arguments.new(ca.MX, **{name: s.numel() for name, s in ocp.functions.arguments.symbols.items()})
+    return at.function("plant", {"xdot": at.given(p=ca.MX(ca.DM(p))).call(f)})
+
+
 class _Noisy:
     """A controller that reads x + noise; sampled, so that each sample has its own noise."""
 
     def __init__(self, controller: Any, horizon: float, hold: int, noise: Array) -> None:
         self.controller, self.step, self.noise = controller, horizon / hold, noise
 
-    def __call__(self, x: Array, t: float) -> Array:
+    def __call__(self, x: Array, t: float, *p: Array) -> Array:
         seen = x + self.noise[:, round(t / self.step)]
         if isinstance(self.controller, ca.Function):
-            return np.asarray(self.controller(seen.T, t).full().T)
-        return np.asarray(self.controller(seen, t))
+            return np.asarray(self.controller(seen.T, t, *(rows.T for rows in p)).full().T)
+        return np.asarray(self.controller(seen, t, *p))
 
 
 def _noise(d: Disturbance, rows: Rows, K: int) -> Array:

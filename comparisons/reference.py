@@ -53,14 +53,15 @@ def resolved(ocp: OCP, start: Solution, kicks: Sequence[tuple[int, Array]]) -> A
     if K % SLOTS:
         raise ValueError(f"the optimum has {K} intervals; expected a multiple of {SLOTS}, where kicks fall")
     solution, cost, now, per_slot = start, np.zeros(len(start)), 0, K // SLOTS
-    found = np.array(start.success, dtype=bool)
+    found, goal = np.array(start.success, dtype=bool), ocp.goals(start.parameters)[0]
     for slot, dx in kicks:
         node = (slot - now) * per_slot
         cost[found] += solution.V[found, 0] - solution.V[found, node]
-        x = np.where(found[:, None], solution.x[:, node] + dx, ocp.x_goal)  # what is lost may have blown up
+        x = np.where(found[:, None], solution.x[:, node] + dx, goal)  # what is lost may have blown up
         u = np.ascontiguousarray(solution.u[:, node:])
         states, gain = np.ascontiguousarray(solution.x[:, node:]), np.ascontiguousarray(solution.gain[:, node:])
         ddp, t0 = DDP(ocp, intervals=K - slot * per_slot, constraints="soft"), slot * ocp.horizon / SLOTS
-        solution, now = better(ddp.solve(x, t0, u=u, x=states, gain=gain), ddp.solve(x, t0, u=u)), slot
+        solution, now = better(ddp.solve(x, t0, u=u, x=states, gain=gain, p=start.p),
+                               ddp.solve(x, t0, u=u, p=start.p)), slot
         found &= solution.success
     return np.where(found, cost + solution.cost, np.inf)

@@ -14,7 +14,7 @@ from nocl.comparisons.report.findings import Region, per_cent
 from nocl.comparisons.report.results import VIOLATION
 from nocl.judge import simulate
 from nocl.ocp import OCP
-from nocl.sampling import Distribution, Gaussian, Uniform
+from nocl.sampling import Distribution, Gaussian, Uniform, own_numbers
 from nocl.scales import usual_sizes
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP
@@ -29,26 +29,27 @@ def region(ocp: OCP, name: str, method: Any, scales: Sequence[float] = SCALES, n
            confidence: float = 0.95, seed: int = 2, progress: bool | None = None) -> Region:
     """The share of n states that succeed at each scale of the distribution's spread, until more than half fail.
 
+    With parameters each state has its own, drawn from where they lie: their distribution does not grow.
+
     A run succeeds that reaches the horizon, violates nothing and costs at most `within` per cent more than the best
     known: its own, or DDP's from cold starts, neighbours and the run itself. Every scale has the same draws, farther
     out.
     """
-    ocp.refuse_parameters("region")
     if not scales or min(scales) <= 0 or list(scales) != sorted(set(scales)):
         raise ValueError(f"scales is {scales!r}; expected rising numbers > 0, like (0.5, 1, 2)")
-    states, good = list[Array](), list[Array]()
+    states, good, p = list[Array](), list[Array](), ocp.sample_parameters(n, own_numbers(seed, 0, 1))
     bar = tqdm(scales, desc=f"region of {name}", unit="scale", leave=False,
                disable=None if progress is None else not progress)
     for scale in bar:
         states.append(grown(ocp.initial_states, scale).sample(n, seed))
-        good.append(succeeds(ocp, method, states[-1], within))
+        good.append(succeeds(ocp, method, states[-1], within, p))
         if good[-1].mean() < 0.5:
             bar.close()
             break
     k = np.array([g.sum() for g in good], dtype=np.int64)
     bounds = np.array([interval(int(one), n, confidence) for one in k])
     return Region(name, within, confidence, np.array(scales[: len(k)], dtype=np.float64), k, n, bounds[:, 0],
-                  bounds[:, 1], np.array(states), np.array(good, dtype=bool))
+                  bounds[:, 1], np.array(states), np.array(good, dtype=bool), p)
 
 
 def grown(distribution: Distribution, scale: float) -> Distribution:
@@ -60,13 +61,15 @@ def grown(distribution: Distribution, scale: float) -> Distribution:
     return Uniform(centre + scale * (lb - centre), centre + scale * (ub - centre))
 
 
-def succeeds(ocp: OCP, method: Any, x0: Array, within: float) -> Array:
-    """[B] bool. A state that violates a constraint itself, or that nobody solves, is no success."""
-    run = simulate(ocp, method, x0)
-    own = simulate(ocp, method, x0, hold=HELD).u[:, :-1]
-    cold = solve_globally(DDP(ocp, intervals=HELD), x0, starts=STARTS, seed=0, workers=1, progress=False).u
-    rival = Reference(ocp, HELD, [own, cold]).solve(x0)
-    judged = simulate(ocp, rival.u, x0)
+def succeeds(ocp: OCP, method: Any, x0: Array, within: float, values: Array) -> Array:
+    """[B] bool, of states with parameters values [B, np]. A state that violates a constraint itself, or that nobody
+    solves, is no success."""
+    p = values if ocp.np else None
+    run = simulate(ocp, method, x0, p=p)
+    own = simulate(ocp, method, x0, hold=HELD, p=p).u[:, :-1]
+    cold = solve_globally(DDP(ocp, intervals=HELD), x0, p=p, starts=STARTS, seed=0, workers=1, progress=False).u
+    rival = Reference(ocp, HELD, [own, cold]).solve(x0, p)
+    judged = simulate(ocp, rival.u, x0, p=p)
     fair = rival.success & ~(judged.violation > VIOLATION)
     best = np.minimum(run.cost, np.where(fair, judged.cost, np.inf))
     ok = run.success & ~(run.violation > VIOLATION)

@@ -37,15 +37,13 @@ def study(ocp: OCP, methods: Mapping[str, Any], n: int = 200, x0: ArrayLike | No
     ocp, methods, n, x0, seed, hold, workers, out, progress, p : as compare has them
     model : the learned dynamics that the controls were made on, for the audits' rollouts
     robust : also the disturbances, on the first ROBUST states (NMPC in closed loop beside its plans), and the region
-        of initial states where each feedback law works; ValueError where the problem has parameters or holds the time
+        of initial states where each feedback law works
     variants, disturbances : of robustness
 
     The reference is DDP's on FINE intervals, from what each method found; it is judged like the others. With `out`
     solves and judged runs are kept; the reference, audits, optima under disturbances and regions are found anew.
     """
     folder = None if out is None else Path(out)
-    if robust:
-        ocp.refuse_parameters("study(robust=True)")
     report = compare(ocp, methods, n, x0, seed, hold, workers, None if folder is None else folder / "compare", progress,
                      p)
     report = with_reference(report, FINE, workers, progress)
@@ -54,7 +52,8 @@ def study(ocp: OCP, methods: Mapping[str, Any], n: int = 200, x0: ArrayLike | No
     if not robust:
         return report
     found = robustness(ocp, with_loops(methods), report.x0[:ROBUST], variants, disturbances, workers,
-                       None if folder is None else folder / "robustness", progress)
+                       None if folder is None else folder / "robustness", progress,
+                       report.p[:ROBUST] if ocp.np else None)
     laws = {name: method for name, method in methods.items() if policy_function(ocp, method) is not None}
     regions = tuple(region(ocp, name, law, progress=progress) for name, law in laws.items())
     return replace(report, robustness=found, regions=regions)

@@ -11,7 +11,9 @@ from movers import law_of_mass, mover, optimum
 
 import nocl
 from nocl.comparisons import at_each, compare, study
+from nocl.comparisons.disturbances import Disturbances, robustness
 from nocl.comparisons.methods import Starts
+from nocl.comparisons.region import region
 from nocl.comparisons.report.payload import payload
 from nocl.solvers import DDP, LQR, NMPC
 
@@ -272,8 +274,6 @@ def test_a_study_holds_audits_and_stability_at_each_p(ocp):
         np.testing.assert_allclose(own.gain[:, 0], gains, rtol=1e-9)
     assert len(report.promises) == 3
     assert "of the initial states and parameters of these distributions end within 2 %" in str(report.promises[0])
-    with pytest.raises(ValueError, match=r"study\(robust=True\) is not implemented for the parameter"):
-        study(ocp, {"by hand": proportional}, n=1, robust=True, progress=False)
 
 
 def test_a_problem_in_time_is_compared():
@@ -283,3 +283,63 @@ def test_a_problem_in_time_is_compared():
     report = study(timed, {"DDP": DDP(timed, intervals=40)}, n=2, workers=1, progress=False)
     assert report.gap[0].max() < 2
     np.testing.assert_allclose(report.audits[0].rollouts[0].cost, report.cost[0], rtol=1e-4)
+
+
+def test_disturbances_at_p_are_those_of_the_problem_there(ocp):
+    """Noise, kicks, delays, wrong plants and the optima under them, of what knows p and of what is made at each p."""
+    p, x0, settings = np.array([0.85, 0.6]), np.array([[0.3, -0.2]]), Disturbances(hold=20, fastest=20)
+    here = ocp.at(p)
+    variant = ocp.functions.arguments.function("twice", {"xdot": ocp.system.equations / 2})
+
+    def by_hand(x, t):
+        return proportional(x, t, np.tile(p, (len(x), 1)))
+
+    folded = ca.Function("twice", here.functions.arguments.inputs, [here.system.equations / 2])
+    every, alone = (robustness(problem, {**laws, "NMPC": NMPC(problem, 10, starts=1, passes=0)}, x0, {"twice": f},
+                               settings, progress=False, p=at)
+                    for problem, laws, f, at in
+                    ((ocp, {"LQR": at_each(ocp, LQR), "by hand": proportional}, variant, p),
+                     (here, {"LQR": LQR(here), "by hand": by_hand}, folded, None)))
+    assert [s.name for s in every.scenarios] == [s.name for s in alone.scenarios]
+    assert {"noise", "kicks", "late", "twice", "controls 20 % weaker"} < {s.name for s in every.scenarios}
+    for a, b in zip(every.scenarios, alone.scenarios, strict=True):
+        for one, other in zip(a.losses, b.losses, strict=True):
+            assert one.success.all()
+            if a.name != "real time":  # whose rates are measured
+                np.testing.assert_allclose(one.cost, other.cost, rtol=1e-6)
+            np.testing.assert_allclose(one.best, other.best, rtol=1e-5)
+
+
+def test_each_state_has_its_own_p_and_kicks_under_disturbances(ocp):
+    """Of what is made at each p, as of what knows it: the second state is no copy of the first."""
+    p, x0 = np.array([[0.85, 0.6], [1.1, -0.4]]), np.array([[0.3, -0.2], [-0.1, 0.4]])
+    def make(one):
+        goal = float(one.x_goal[0])
+        return lambda x, t: 3 * (goal - x[:, :1] - x[:, 1:])
+
+    def same(x, t, p):
+        return 3 * (p[:, 1:] - x[:, :1] - x[:, 1:])
+
+    found = robustness(ocp, {"each": at_each(ocp, make), "rows": same}, x0, None, Disturbances(hold=20), p=p,
+                       progress=False)
+    for s in found.scenarios:
+        if s.name != "real time":
+            each, rows = s.losses
+            np.testing.assert_allclose(each.cost, rows.cost, rtol=1e-6)
+            assert each.cost[0] != pytest.approx(each.cost[1])
+
+
+def test_the_region_grows_in_x0_and_keeps_p_where_it_lies(ocp):
+    """A law that is given up for goals above 0.5 fails as often as they are drawn, at any scale."""
+    at = ocp.functions.feedback(ca.MX)
+    x, t, p = at.inputs
+    near = LQR(ocp.at([1.0, 0.0])).to_casadi()(x - ca.vertcat(p[1], 0), t)
+    law = at.function("policy", {"u": ca.if_else(p[1] > 0.5, 0.0, near)})
+    found = region(ocp, "law", law, scales=(0.5, 1.0), n=20, within=50.0, progress=False)
+    assert found.p.shape == (20, 2)
+    low, high = ocp.parameter_box
+    assert ((found.p >= low) & (found.p <= high)).all()
+    fails = found.p[:, 1] > 0.5
+    assert 2 < fails.sum() < 10
+    assert not found.success[:, fails & (np.abs(found.x0[0, :, 0]) < 0.4)].any()
+    assert found.success[:, ~fails].mean() > 0.9

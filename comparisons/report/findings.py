@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -215,6 +215,7 @@ class Region:
     upper: Array  # [S]
     x0: Array  # [S, n, nx]
     success: NDArray[np.bool_]  # [S, n]
+    p: Array = field(default_factory=lambda: np.zeros((0, 0)))  # [n, np], the same at each scale
 
     def summary(self) -> Row:
         return {"method": self.method, "within": self.within, "confidence": self.confidence, "n": self.n,

@@ -286,11 +286,6 @@ def _compare(args: argparse.Namespace) -> None:
     cnd = load_run(run, args.p)
     out = args.out if args.out is not None else run / "report"
     arguments.check_out(out)
-    if args.robust and cnd.ocp.np:
-        raise ValueError(f"--robust is not implemented for the parameter(s) {', '.join(cnd.ocp.parameter_names)}; "
-                         f"expected a problem without: give {registry.asked(cnd.ocp)}")
-    if args.robust:
-        cnd.ocp.refuse_parameters("--robust")
     seed = int(cnd.card.get("seed", 0)) if args.seed is None else args.seed
     _refuse(cnd.ocp, args.methods, registry.Options(args.intervals, seed))
     with alone(beside(out, run)):  # where outcomes so far are kept
