@@ -93,7 +93,7 @@ def test_the_noise_is_what_the_fit_leaves_but_for_the_starts_freedom():
         start = start + p.normal(theta, start)[2]
     np.testing.assert_allclose(p.noise(theta, start), sigma, rtol=0.15)  # of 400 degrees of freedom: 3.5 %
     naive = w.residuals(w.paths(p.f(theta), start, 1)).square().mean(dim=(0, 1)).sqrt() * w.noise
-    assert (naive < 0.9 * sigma).all()
+    assert (naive < 0.95 * sigma).all()  # sqrt(2 / 3) of it, and four times those 3.5 %
 
 
 def test_each_step_lowers_the_error():
