@@ -160,19 +160,31 @@ def _polynomial(coefficients: Array, tau: ca.SX) -> ca.SX:
 
 
 def policy_net(ocp: OCP, labels: Labels, sizes: tuple[int, ...], control_dt: bool = False,
-               own: ca.Function | None = None) -> tuple[FeatureNet, ca.Function]:
+               own: ca.Function | None = None, branches: int = 1) -> tuple[FeatureNet, ca.Function]:
     """(u = clip(mean + spread * y, U), y a tanh network of the features; and u -> y, its inverse inside U).
 
-    control_dt: (x, t[, p], dt) -> u in place of (x, t[, p]) -> u. own: further features.
+    control_dt: (x, t[, p], dt) -> u in place of (x, t[, p]) -> u. own: further features. With `branches` > 1 the
+    network says as many y, and a number for each: that with the largest number is taken.
     """
     s = ocp.system
     phi = features(ocp, labels, labels.dt if control_dt else None, own=own)
     mean, spread = ca.DM(labels.u.mean(axis=0)), ca.DM(labels.u.std(axis=0) + 1e-9 * usual_sizes(ocp).u)
-    y, u = ca.SX.sym("y", s.nu), ca.SX.sym("u", s.nu)
-    clipped = ca.fmin(ca.fmax(mean + spread * y, ca.DM(s.lbu)), ca.DM(s.ubu))
+    said = branches * (s.nu + 1) if branches > 1 else s.nu
+    y, u = ca.SX.sym("y", said), ca.SX.sym("u", s.nu)
+    clipped = ca.fmin(ca.fmax(mean + spread * _chosen(y, s.nu, branches), ca.DM(s.lbu)), ca.DM(s.ubu))
     outputs = Arguments.of(phi).function("controls", {"u": clipped}, y=y)
-    net = FeatureNet(phi, [MLP([phi.numel_out(0), *sizes, s.nu])], outputs)
+    net = FeatureNet(phi, [MLP([phi.numel_out(0), *sizes, said])], outputs)
     return net, ca.Function("inverse", [u], [(u - mean) / spread], ["u"], ["y"])
+
+
+def _chosen(y: ca.SX, nu: int, branches: int) -> ca.SX:
+    """The branch with the largest number, of y = (y_1, y_2, ..., numbers)."""
+    numbers = y[branches * nu:] if branches > 1 else y[:1]
+    best, most = y[:nu], numbers[0]
+    for k in range(1, branches):
+        best = ca.if_else(numbers[k] > most, y[k * nu:(k + 1) * nu], best)
+        most = ca.fmax(most, numbers[k])
+    return best
 
 
 def at_rate(net: FeatureNet, dt: float) -> FeatureNet:

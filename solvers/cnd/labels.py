@@ -15,12 +15,13 @@ from nocl.data import Solution
 from nocl.ocp import OCP
 from nocl.sampling import Uniform, box
 from nocl.solvers.cnd.in_torch import InTorch
-from nocl.solvers.ddp.bank import Rows, SolutionBank, better
+from nocl.solvers.ddp.bank import Rows, SolutionBank, better, extend
 from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
 from nocl.translate.rk4 import rk4
 
 Policy = Callable[..., Tensor]  # (x, t[, p]) -> u
+NEIGHBOURS = 6  # starts of a tail of a problem with parameters: the nearest one's optimum may be of another kind
 NEAR = 0.1  # how near hard problems more are drawn
 SMALL = 0.1  # of a usual cost: what is added to costs before anything is divided by them
 COARSE = (2, 5, 10, 20, 40, 160, 640)  # intervals of tails that are solved for other control rates than the labels'
@@ -93,9 +94,12 @@ def at_other_rates(ddp: DDP, solution: Solution, unit: float, rng: np.random.Gen
 
 
 def tube(ddp: DDP, bank: SolutionBank, n: int, width: float, rng: np.random.Generator) -> Solution:
-    """Tails from n random states near the bank's trajectories, each from the solution it is near."""
-    rows, problems = tube_states(ddp.ocp, bank, n, width, rng)
-    return ddp.solve(problems.x, problems.t, p=problems.given_p, **bank.guess(rows, problems.t, problems.x))
+    """Tails from n random states near the bank's trajectories, each from the solution it is near; with parameters the
+    best of that and of starts from the nearest others.
+    """
+    rows, at = tube_states(ddp.ocp, bank, n, width, rng)
+    own = ddp.solve(at.x, at.t, p=at.given_p, **bank.guess(rows, at.t, at.x))
+    return better(own, extend(ddp, bank, at.x, NEIGHBOURS, at.t, at.p)) if ddp.ocp.np else own
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,11 +187,12 @@ def kicked_states(bank: SolutionBank, policy: Policy, torch_ocp: InTorch, n: int
 
 
 def answered(ddp: DDP, bank: SolutionBank, policy: Policy, torch_ocp: InTorch, at: Problems) -> Solution:
-    """Tails from there: the better of a start from the policy's own answer and one from the nearest solution."""
+    """Tails from there: the best of a start from the policy's own answer and of one from the nearest solution, or with
+    parameters from several of them.
+    """
     p = at.given_p
     own = ddp.solve(at.x, at.t, u=policy_controls(policy, torch_ocp, at, ddp.intervals, ddp.substeps), p=p)
-    near = ddp.solve(at.x, at.t, p=p, **bank.guess(bank.nearest(at.x, at.t, p=p)[:, 0], at.t, at.x))
-    return better(own, near)
+    return better(own, extend(ddp, bank, at.x, NEIGHBOURS if ddp.ocp.np else 1, at.t, p))
 
 
 def kicked_rollout(torch_ocp: InTorch, policy: Policy, start: Problems, kick: Array, rng: np.random.Generator,

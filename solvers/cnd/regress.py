@@ -16,6 +16,7 @@ from nocl.ocp import OCP
 from nocl.solvers.cnd.labels import Labels
 from nocl.translate.torch_functions import to_torch
 
+SAME = 0.1  # squared error, in units of the controls' variance, within which a branch is taken for a label's own
 LossFunction = Callable[[Tensor], Tensor]  # row numbers of the labels -> a scalar
 OnStep = Callable[[float], Any]  # called once an iteration with the loss
 
@@ -50,20 +51,38 @@ def policy_loss(ocp: OCP, net: FeatureNet, inverse: ca.Function, labels: Labels)
 
     For control-affine problems that is the cost lost along the labelled paths, as a share of what they cost. Answers
     beyond a bound that is active in the label cost nothing: they are clipped to it.
+
+    Of a network with branches it is SAME times -log of the likelihood of a mixture: Gaussians about the branches, with
+    such squared errors of SAME, and shares that are the softmax of their numbers (mixture density networks, Bishop
+    1994). Each label pulls at the branch that is near it, and at the numbers.
     """
     to_y = to_torch(inverse)
     target = to_y(torch.from_numpy(labels.u)).float()
     low, high = (to_y(torch.from_numpy(np.array(b))[None]).float() for b in (ocp.system.lbu, ocp.system.ubu))
     lowest, highest = target <= low + 1e-4, target >= high - 1e-4
-    weight = torch.from_numpy(labels.weight / labels.weight.mean()).float()[:, None] * _control_weights(ocp, low, high)
+    nu = target.shape[1]
+    each = _control_weights(ocp, low, high)
+    of_label = torch.from_numpy(labels.weight / labels.weight.mean()).float()[:, None]
+    weight = of_label * each
     phi = _features(net, labels)
 
     def loss(rows: Tensor) -> Tensor:
         y, wanted = net.nets[0](phi[rows]), target[rows]
-        free = ~((lowest[rows] & (y < wanted)) | (highest[rows] & (y > wanted)))
-        return (weight[rows] * free * (y - wanted) ** 2).mean()
+        if y.shape[1] == nu:
+            return (weight[rows] * _off(y, wanted, lowest[rows], highest[rows])).mean()
+        branches, numbers = torch.split(y, [y.shape[1] * nu // (nu + 1), y.shape[1] // (nu + 1)], dim=1)
+        off = torch.stack([(each * _off(branch, wanted, lowest[rows], highest[rows])).mean(dim=1)
+                           for branch in torch.split(branches, nu, dim=1)], dim=1)
+        likely = torch.logsumexp(torch.log_softmax(numbers, dim=1) - off / SAME, dim=1)
+        return -(of_label[rows, 0] * SAME * likely).mean()
 
     return loss
+
+
+def _off(y: Tensor, wanted: Tensor, lowest: Tensor, highest: Tensor) -> Tensor:
+    """Squared errors [n, nu]; 0 beyond a bound that is active in the label."""
+    free = ~((lowest & (y < wanted)) | (highest & (y > wanted)))
+    return free * (y - wanted) ** 2
 
 
 def _control_weights(ocp: OCP, low: Tensor, high: Tensor) -> Tensor:

@@ -29,19 +29,23 @@ class TrainSettings(Scaled):
                  "gap_median": 5e-5, "gap_p95": 2.5e-4}}
 
     # by how much more of each a problem with parameters takes, for each of them; MOST: as many parameters at most
-    MORE: ClassVar[Mapping[str, float]] = {"seeds": 1 / 2, "states": 1 / 2, "tails": 1 / 4, "visits": 1 / 4,
-                                           "iterations": 1 / 8, "hidden": 1 / 8}
+    MORE: ClassVar[Mapping[str, float]] = {"seeds": 1 / 2, "states": 1 / 2, "tails": 1 / 8, "visits": 1 / 8,
+                                           "iterations": 1 / 16, "hidden": 1 / 16}
     MOST: ClassVar[int] = 8
+    BRANCHES: ClassVar[int] = 2  # with parameters: optima of other kinds are the rule then
 
     @classmethod
     def of(cls, effort: str, *, parameters: int = 0, **changes: Any) -> TrainSettings:
         """The settings of an effort, "quick", "normal" or "best", with changes of single fields.
 
-        parameters : how many the problem has (OCP.np): the more, the more labels, the longer and wider the regression
+        parameters : how many the problem has (OCP.np): the more, the more labels, the longer and wider the regression;
+            with any, BRANCHES
         """
         n = min(checks.whole(parameters, "parameters", "TrainSettings.of", 0), cls.MOST)
         usual = asdict(super().of(effort))
-        more = {name: _times(usual[name], 1 + n * share) for name, share in cls.MORE.items()} if n else {}
+        more = {name: _times(usual[name], 1 + n * share) for name, share in cls.MORE.items()}
+        if n:
+            more["branches"] = max(usual["branches"], cls.BRANCHES)
         return cls(**{**usual, **more, **changes})
 
     intervals: int = count(80, "held controls of each labelled solution")
@@ -60,6 +64,7 @@ class TrainSettings(Scaled):
     batch: int = count(1024, "labels in a step of a regression")
     lr: float = positive(4e-3, "of SOAP")
     hidden: tuple[int, ...] = widths((64, 64, 64), "of the hidden layers of u and of V")
+    branches: int = count(1, "answers that the network chooses among: more than 1 where optima of several kinds meet")
     control_dt: bool = flag(False, "True: u(x, t, dt), optimal in continuous time and held for dt; see CND.at_rate")
     value: bool = flag(True, "whether to train V(x, t) too")
     value_initial: int = count(1500, "initial states solved for V, from the nearest solutions and the policy's answers")

@@ -36,7 +36,7 @@ from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.features import at_rate, own_features, policy_net
 from nocl.solvers.cnd.identity import identity
 from nocl.solvers.cnd.in_torch import InTorch
-from nocl.solvers.cnd.labels import Labels, Problems, answered, at_other_rates, tube, visited
+from nocl.solvers.cnd.labels import NEIGHBOURS, Labels, Problems, answered, at_other_rates, tube, visited
 from nocl.solvers.cnd.paper import PaperSettings, train_paper
 from nocl.solvers.cnd.regress import fit_net, policy_loss
 from nocl.solvers.cnd.settings import TrainSettings
@@ -52,7 +52,7 @@ from nocl.solvers.cnd.validate import (
     value_scores,
 )
 from nocl.solvers.cnd.value import ValueLabels, on_fine_grid, value_loss, value_net, value_tails
-from nocl.solvers.ddp.bank import SolutionBank, extend
+from nocl.solvers.ddp.bank import SolutionBank, better, extend
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP, substeps_for
 from nocl.substeps import FINE
@@ -69,7 +69,6 @@ __all__ = ["TrainSettings", "train"]
 CHECKPOINT = "training.safetensors"
 VALUE_LARGE = 0.05  # mean |V - J*| / J* that a warning is given above
 VALUE_HELD_OUT = 16  # times held_out: a mean of relative errors hangs on the few states that are hard
-HARD = 4  # times held_out: fresh problems with parameters, the hardest eighth of which each round looks at
 LOSSES = 40  # of each regression that the card keeps
 
 
@@ -190,7 +189,7 @@ class Training:
             self.bank = SolutionBank.of(self.ddp, seeds)
             if s.states:
                 further = Problems.initial(self.ocp, s.states, rng)
-                more = extend(self.ddp, self.bank, further.x, p=further.given_p)
+                more = extend(self.ddp, self.bank, further.x, NEIGHBOURS if self.ocp.np else 3, p=further.given_p)
                 self.bank = SolutionBank.of(self.ddp, type(more).join([seeds, more]))
             parts = [self.bank.solution] + ([tube(self.ddp, self.bank, s.tails, s.width, rng)] if s.tails else [])
             self.labels = Labels.join([self._labels(p, rng) for p in parts])
@@ -211,7 +210,7 @@ class Training:
         """The policy's networks, scaled by the first labels."""
         with _seeded(self.seed):
             self.net, self.inverse = policy_net(self.ocp, self.labels[: self.first], self.settings.hidden,
-                                                self.settings.control_dt, self.own)
+                                                self.settings.control_dt, self.own, self.settings.branches)
         self.policy = at_rate(self.net, 0.0) if self.settings.control_dt else self.net  # in continuous time
 
     def _visit(self) -> None:
@@ -223,17 +222,19 @@ class Training:
             bar.update()
 
     def _hardest(self, rng: np.random.Generator) -> Problems:
-        """The fresh problems that the controller is worst at, solved from cold starts: what they tell joins the labels
-        and the bank."""
+        """Of as many fresh problems as states are visited those that the controller is worst at, these solved from cold
+        starts too; what all of them tell joins the labels and the bank."""
         s = self.settings
-        fresh = Problems.initial(self.ocp, HARD * s.held_out, rng)
+        fresh = Problems.initial(self.ocp, s.visits, rng)
         best = answered(self.ddp, self.bank, self.policy, self.in_torch, fresh)
         lost = np.nan_to_num(gap(self.policy, self.in_torch, best, substeps=self.substeps), nan=np.inf)
-        worst = fresh[np.argsort(-np.abs(lost), kind="stable")[:s.held_out // 2]]
-        solved = solve_globally(self.ddp, worst.x, p=worst.given_p, starts=s.starts, seed=rng)
-        self.bank = self.bank.add(solved)
-        self.labels = Labels.join([self.labels, self._labels(solved, rng)])
-        return worst
+        worst = np.argsort(-np.abs(lost), kind="stable")[:s.held_out // 2]
+        hard = fresh[worst]
+        cold = solve_globally(self.ddp, hard.x, p=hard.given_p, starts=s.starts, seed=rng)
+        best.put(worst, better(best[worst], cold))
+        self.bank = self.bank.add(best)
+        self.labels = Labels.join([self.labels, self._labels(best, rng)])
+        return hard
 
     def _regress(self, iterations: int) -> None:
         s = self.settings
