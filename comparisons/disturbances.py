@@ -71,6 +71,7 @@ def robustness(ocp: OCP, methods: Mapping[str, Any], x0: ArrayLike, variants: Ma
         counts), a casadi.Function (x, u) -> xdot, or an object with `to_casadi()`
     """
     ocp.refuse_parameters("robustness")
+    ocp.refuse_constraints("robustness")
     rows, _ = checks.states(x0, ocp.system.nx, ocp.system.name)
     return _Study(ocp, checked(methods), rows.copy(), settings or Disturbances(), workers,
                   None if out is None else Path(out), progress).run(variants or {})

@@ -34,6 +34,7 @@ def region(ocp: OCP, name: str, method: Any, scales: Sequence[float] = SCALES, n
     out.
     """
     ocp.refuse_parameters("region")
+    ocp.refuse_constraints("region")
     if not scales or min(scales) <= 0 or list(scales) != sorted(set(scales)):
         raise ValueError(f"scales is {scales!r}; expected rising numbers > 0, like (0.5, 1, 2)")
     states, good = list[Array](), list[Array]()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from nocl.constraints import Free
 from nocl.ocp import OCP
 from nocl.parameters import parameter, time
 from nocl.sampling import Gaussian, Uniform
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from nocl.translate.torch_functions import to_torch
 
 __version__ = "0.1.0"
-__all__ = ["CND", "OCP", "Dataset", "Ensemble", "Gaussian", "LearnedDynamics", "Log", "Solution", "System",
+__all__ = ["CND", "OCP", "Dataset", "Ensemble", "Free", "Gaussian", "LearnedDynamics", "Log", "Solution", "System",
            "Trajectory", "Uniform", "comparisons", "held_inputs", "identify", "load_ocp", "parameter", "pretrained",
            "simulate", "smooth_abs", "smooth_max", "solvers", "split_controls", "systems", "time", "to_acados",
            "to_casadi", "to_control", "to_do_mpc", "to_gymnasium", "to_torch", "train"]

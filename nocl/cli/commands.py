@@ -178,7 +178,7 @@ def _list(args: argparse.Namespace) -> None:
     for name in NAMES:
         ocp = load_ocp(name)
         s = ocp.system
-        print(f"{name.ljust(width)}  {s.nx:6d}  {s.nu:8d}  {ocp.horizon:7g}  {_about(name)}")
+        print(f"{name.ljust(width)}  {s.nx:6d}  {s.nu:8d}  {ocp.longest:7g}  {_about(name)}")
 
 
 def _about(name: str) -> str:

@@ -301,7 +301,7 @@ def _verdict(ocp: OCP, arrays: dict[str, Any], judged: dict[str, Any], message: 
     rows = np.flatnonzero(~np.isnan(judged.get("judged_cost", np.zeros(0))))
     if len(rows):
         cost, clear = judged["judged_cost"][rows], judged["judged_clearance"][rows]
-        clearance = f"; least clearance {clear.min():.3g}" if ocp.path_constraints else ""
+        clearance = f"; least clearance {clear.min():.3g}" if ocp.constraint_names else ""
         said.append(f"judged in open loop on the exact f, {count(len(rows), 'plan')}: mean cost {cost.mean():.4g}, "
                     f"predicted {arrays['cost'][rows].mean():.4g}{clearance}")
         most = COARSE * np.abs(arrays["cost"][rows]) + TINY * usual_sizes(ocp).cost
