@@ -2,11 +2,12 @@
 
 A user's forms become a `Constraint` each; those of a problem become `Rows` for solvers: c >= 0, or c = 0, one a row.
 
-Their units say nothing: a metre, or its square. So each constraint has a scale, which violations, margins and tolerances
-are shares of. Where the user gives none, the scale of an inequality is how deep its forbidden set is in X x U, max -c,
-or, where that is less, how large |c| is where the problem takes place, at (x*, u*) and at initial states under u*: 1 %
-of a pillar's radius, 1 % of the distance to a wall. Of two sides the smaller one counts, and half their distance. At the
-end of a trajectory the problem takes place at x*. The scale of an equation is the largest |c| in X x U.
+Their units say nothing: a metre, or its square. So each constraint has a scale, which violations, margins and
+tolerances are shares of. Where the user gives none, the scale of an inequality is how deep its forbidden set is in
+X x U, max -c, or, where that is less, how large |c| is where the problem takes place, at (x*, u*) and at initial states
+under u*: 1 % of a pillar's radius, 1 % of the distance to a wall. Of two sides the smaller one counts, and half their
+distance. At the end of a trajectory the problem takes place at x*. The scale of an equation is the largest |c| in
+X x U.
 """
 
 from __future__ import annotations
@@ -200,7 +201,7 @@ def read_bounds(given: Any, owner: str, states: Sequence[str]) -> Mapping[str, t
                              "constraints= takes expressions")
         if not isinstance(pair, (tuple, list)) or len(pair) != 2:
             raise ValueError(f"{owner}: {what} is {checks.shown(pair)}; expected (low, high), None for no bound")
-        low, _, high = _bounds(*pair, what, owner, None)
+        low, _, high = _bounds(pair[0], pair[1], what, owner, None)
         if low == high:
             raise ValueError(f"{owner}: {what} is ({low:g}, {high:g}); expected low < high: a state that never moves "
                              "is a parameter")
@@ -224,8 +225,8 @@ def check_unique(constraints: Sequence[Constraint], owner: str) -> None:
     seen: dict[str, Constraint] = {}
     for one in constraints:
         if one.name in seen:
-            raise ValueError(f"{owner}: {seen[one.name].title} and {one.title} have one name; expected each its own, by "
-                             "which scales, soft constraints and messages know it: rename one")
+            raise ValueError(f"{owner}: {seen[one.name].title} and {one.title} have one name; expected each its own, "
+                             "by which scales, soft constraints and messages know it: rename one")
         seen[one.name] = one
 
 
@@ -236,13 +237,13 @@ def _check_names(given: Any, field: str, owner: str, what: str) -> None:
 
 def _bounds(low: Any, high: Any, what: str, owner: str, expression: Any) -> tuple[float, Any, float]:
     """(low, expression, high) as floats, +-inf for no bound."""
-    found = [_bound(value, none, what, owner) for value, none in ((low, -math.inf), (high, math.inf))]
-    if found == [-math.inf, math.inf]:
+    low, high = _bound(low, -math.inf, what, owner), _bound(high, math.inf, what, owner)
+    if low == -math.inf and high == math.inf:
         raise ValueError(f"{owner}: {what} has neither a low nor a high bound; expected one at least: leave it out")
-    if not found[0] <= found[1] or math.isinf(found[0]) and found[0] > 0 or math.isinf(found[1]) and found[1] < 0:
-        raise ValueError(f"{owner}: {what} is to lie between {found[0]:g} and {found[1]:g}, which nothing does; "
+    if not low <= high or low == math.inf or high == -math.inf:
+        raise ValueError(f"{owner}: {what} is to lie between {low:g} and {high:g}, which nothing does; "
                          "expected low <= high: swap them")
-    return found[0], expression, found[1]
+    return low, expression, high
 
 
 def _bound(value: Any, none: float, what: str, owner: str) -> float:

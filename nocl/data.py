@@ -118,6 +118,7 @@ class Solution:
     dense: Array | None = None  # [B, K, 4, 2 nx]: (x, costate) at both ends of intervals, their time derivatives
     p: Array | None = None  # [B, np], the parameters of each problem; None where it has none
     V_p: Array | None = None  # [B, np], dJ*/dp; None where there are no parameters
+    slack: Array | None = None  # [B, K+1, n], by how much each of NMPC's n soft constraints is exceeded, in its scale
 
     def __len__(self) -> int:
         return len(self.cost)

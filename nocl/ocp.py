@@ -406,7 +406,7 @@ class OCP:
         """Whether all constraints are inequalities of (x, t, p) along the trajectory: those that `h` has."""
         return len(self.functions.rows) == self.functions.rows.n_h and not self.held_at_end
 
-    def refuse_constraints(self, owner: str) -> None:
+    def refuse_constraints(self, owner: str, remedy: str = "solve it by NMPC") -> None:
         """ValueError for constraints that hold a control, equations, terminal constraints and a free horizon: for what
         has no use of them, or not yet.
         """
@@ -417,8 +417,8 @@ class OCP:
         beyond += [f"the {one.title}" for one in self.held_at_end]
         if beyond:
             raise ValueError(f"{owner} takes inequalities of (x, t, p) alone as constraints, but the problem on "
-                             f"{self.system.name!r} has {', '.join(dict.fromkeys(beyond))}: solve it by NMPC, or leave "
-                             "them out, dataclasses.replace(ocp, constraints={}, terminal_constraints={})")
+                             f"{self.system.name!r} has {', '.join(dict.fromkeys(beyond))}: {remedy}, or leave them "
+                             "out, dataclasses.replace(ocp, constraints={}, terminal_constraints={})")
 
     def refuse_free(self, owner: str) -> None:
         """ValueError for a free horizon."""
@@ -737,7 +737,8 @@ class OCP:
             horizon = data["horizon"]
             more = {kind: _constraints_from(data[kind], at) for kind in ("constraints", "terminal_constraints")
                     if kind in data}
-            return OCP(system, horizon=Free(*horizon["free"]) if isinstance(horizon, Mapping) else horizon, x_goal=goal[0], u_goal=goal[1],
+            horizon = Free(*horizon["free"]) if isinstance(horizon, Mapping) else horizon
+            return OCP(system, horizon=horizon, x_goal=goal[0], u_goal=goal[1],
                        running=read(data["L"], at), terminal=read(data["G"], at), p=p,
                        parameters=sampling.from_data(data["parameters"]) if "parameters" in data else None,
                        initial_states=sampling.from_data(data["initial_states"]),

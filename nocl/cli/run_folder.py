@@ -267,7 +267,7 @@ def solve(ocp: OCP, out: Path, name: str, n: int, options: registry.Options, wor
     method = built(ocp, registry.METHODS[name], options)
     planned = is_plan(method)
     s, arrays, facts = _solved(ocp, method, starts, workers, checkpoint) if planned else _simulated(ocp, method, starts)
-    judged = _judged(ocp, starts, arrays) if planned else {}
+    judged = _judged(ocp, starts, arrays) if planned and not ocp.is_free else {}  # no judge has a free horizon yet
     if ocp.np:
         arrays["p"], facts["parameters"] = starts.p, list(ocp.parameter_names)
     if at:
