@@ -250,8 +250,8 @@ def _bound(value: Any, none: float, what: str, owner: str) -> float:
     if value is None:
         return none
     if isinstance(value, (ca.SX, ca.MX)):
-        raise ValueError(f"{owner}: a bound of {what} is the expression {checks.shown(value)}; expected a number: write "
-                         "its two sides as constraints of their own, e - low and high - e, each >= 0")
+        raise ValueError(f"{owner}: a bound of {what} is the expression {checks.shown(value)}; expected a number: "
+                         "write its two sides as constraints of their own, e - low and high - e, each >= 0")
     found = checks.finite(value)
     infinite = isinstance(value, (float, np.floating)) and math.isinf(value)
     if found is None and not infinite:
@@ -331,7 +331,7 @@ class _Search:
 
 
 def joined(rows: Rows, each: Array, given: Mapping[str, float]) -> Array:
-    """The scale of each row's constraint [m], of those of the rows alone: the smaller one, or the one that was given."""
+    """The scale of each row's constraint [m]: the one that was given, or the smaller one of its rows alone."""
     least: dict[str, float] = {}
     for one, size in zip(rows.of, each, strict=True):
         least[one.name] = min(least.get(one.name, one.width), float(size))

@@ -114,7 +114,7 @@ class Solution:
     V_xx: Array | None = None  # [B, K+1, nx, nx]
     tried: Array | None = None  # [B, n], the cost that each start ended at: inf, it failed; NaN, there were fewer
     unit: Array | None = None  # [B], what costs of the problem usually are
-    clearance: Array | None = None  # [B], min of all constraints at the nodes, as Simulation has it; inf: there are none
+    clearance: Array | None = None  # [B], min of all constraints at the nodes, as Simulation has it; inf: there is none
     dense: Array | None = None  # [B, K, 4, 2 nx]: (x, costate) at both ends of intervals, their time derivatives
     p: Array | None = None  # [B, np], the parameters of each problem; None where it has none
     V_p: Array | None = None  # [B, np], dJ*/dp; None where there are no parameters

@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from types import MappingProxyType
 from typing import Any
 
 import casadi as ca
@@ -433,7 +432,7 @@ class OCP:
         return self.with_constraints(lambda e: None)
 
     def with_constraints(self, made: Callable[[ca.SX], Any], **changed: Any) -> OCP:
-        """dataclasses.replace(self, **changed), each expression of a constraint as `made` has it; None leaves it out."""
+        """dataclasses.replace(self, **changed), expressions of constraints as `made` has them; None leaves one out."""
         def each(given: Mapping[str, Any]) -> dict[str, Any]:
             new = {name: (one, made(one.expression)) for name, one in given.items()}
             return {name: Within(one.low, e, one.high) for name, (one, e) in new.items() if e is not None}

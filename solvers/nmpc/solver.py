@@ -531,7 +531,7 @@ def _given(guess: Any, nmpc: NMPC, x0: Array, t: Array, p: Array) -> list[Guess]
 
 def _of_free(guess: Any, nmpc: NMPC, x0: Array, t: Array, p: Array) -> list[Guess]:
     """A guess where the horizon is free: a Solution or Trajectory, which have one, or (x, u) of a middling one."""
-    if callable(guess) and not isinstance(guess, Solution) or not (_is_solution(guess) or isinstance(guess, tuple)):
+    if not (_is_solution(guess) or isinstance(guess, tuple)):
         raise ValueError(f"NMPC: the guess is a {type(guess).__name__}, which says no horizon, and that is free; "
                          "expected a Solution, a Trajectory, or states and controls (x [B, N+1, nx], u [B, N, nu])")
     s, N, B = nmpc.ocp.system, nmpc.intervals, len(x0)

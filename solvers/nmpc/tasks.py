@@ -137,8 +137,8 @@ def _third_opinion(program: Transcription, task: Task, answers: Sequence[Answer]
     most, where = program.elastic.worst_slack(t, near.x, near.u, task.p)
     if most <= FEASIBLE:
         return [program.second.solve(task.x0, t, near.x, near.u, task.time_limit, task.p)]
-    return [replace(near, success=False, cost=np.inf, outcome=NOT_HELD, violation=most, message="infeasible: no plan was "
-                    f"found that holds all constraints; of the one that comes nearest, {where}")]
+    why = f"infeasible: no plan was found that holds all constraints; of the one that comes nearest, {where}"
+    return [replace(near, success=False, cost=np.inf, outcome=NOT_HELD, violation=most, message=why)]
 
 
 def solved_by(ocp: OCP, t: Array, outcomes: Sequence[Outcome], p: Array | None = None) -> Solution:

@@ -2,9 +2,10 @@
 
 Variables w = [x_0, u_0, x_1, u_1, ..., x_N], parameters p = [x_0, h_0, ..., h_{N-1}, t_N], the lengths of the
 intervals and the time of the last node, then the parameters of the problem.
-Constraints, stage by stage: x_{k+1} - F(x_k, u_k; h_k) = 0, then x_0 - p = 0 at k = 0 and the problem's own (held.py). A
-free horizon T stands behind the state of each node, T_{k+1} = T_k, and h_k are then shares of it. A soft constraint has
-slacks behind u_k. A gap's multiplier is minus the costate of the node that it leads to: lambda_{k+1} = dJ*/dx_{k+1}.
+Constraints, stage by stage: x_{k+1} - F(x_k, u_k; h_k) = 0, then x_0 - p = 0 at k = 0 and the problem's own
+(held.py). A free horizon T stands behind the state of each node, T_{k+1} = T_k, and h_k are then shares of it. A soft
+constraint has slacks behind u_k. A gap's multiplier is minus the costate of the node that it leads to:
+lambda_{k+1} = dJ*/dx_{k+1}.
 """
 
 from __future__ import annotations
