@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from nocl.support import checks
 from nocl.support.checks import Array
+from nocl.system import System
 from nocl.translate.arguments import Arguments
 
 SAMPLES = 4096  # of X x U
@@ -34,6 +35,32 @@ PATH, ALONG, BOUND, END = "path constraint", "constraint", "state bound", "termi
 FORM = "an expression, which is held >= 0, or (low, expression, high), None for no bound, low = high for an equation"
 
 Places = dict[str, Array]  # x [n, nx], u [n, nu], t [n], p [n, np]
+
+
+def limit_rates(system: System, rates: Mapping[str, float]) -> System:
+    """The system with each named control u as a state, behind the others, and its rate as the control: |du/dt| <= rate.
+
+    u keeps its symbol, so that costs are written as before, and moves in straight lines where its rate is held. Its
+    bounds are a constraint of states now: nocl.OCP(..., state_bounds={"u": (low, high)}). Initial states and goals have
+    it as a coordinate. Raises ValueError for names of no control, and for rates that are no positive numbers.
+    """
+    checks.instance(System, system, "system", "limit_rates", "of an OCP, pass ocp.system")
+    if not isinstance(rates, Mapping) or not rates or any(name not in system.control_names for name in rates):
+        raise ValueError(f"limit_rates: rates is {checks.shown(rates)}; expected a dict from names of controls "
+                         f"({', '.join(system.control_names)}) to the largest rate of each")
+    most = {name: checks.number(rate, f"the rate of {name}", "limit_rates", positive=True)
+            for name, rate in rates.items()}
+    parts = {name: (u, low, high) for name, u, low, high in
+             zip(system.control_names, ca.vertsplit(system.arguments["u"]), system.lbu, system.ubu, strict=True)}
+    slow = [parts[name] for name in most]
+    fresh = {name: (ca.SX.sym(f"{name}_rate"), -most[name], most[name]) if name in most else part
+             for name, part in parts.items()}
+    u, lbu, ubu = zip(*fresh.values(), strict=True)
+    at = system.arguments
+    return System(f"{system.name}_rates", x=ca.vertcat(at["x"], *(part[0] for part in slow)), u=ca.vertcat(*u),
+                  xdot=ca.vertcat(at.call(system.f), *(fresh[name][0] for name in most)), lbu=lbu, ubu=ubu,
+                  lbx=np.r_[system.lbx, [part[1] for part in slow]], ubx=np.r_[system.ubx, [part[2] for part in slow]],
+                  p=at.symbols.get("p"), angles=system.angles, units=dict(system.units))
 
 
 @dataclass(frozen=True)

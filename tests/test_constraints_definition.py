@@ -276,3 +276,23 @@ def test_who_violates_has_failed_in_a_comparison():
     said = "one violates a constraint on 1 of 1; idle violates a constraint on 1 of 1"
     assert any(said in sentence for sentence in report.verdict())
     assert "% of its scale" in report.violated(0, 0)
+
+
+def test_rates_make_a_control_a_state():
+    two = ca.SX.sym("thrust")
+    system = nocl.System("two", x=ca.vertcat(P, V), u=ca.vertcat(U, two), xdot=ca.vertcat(V, U * W + two), p=W,
+                         lbu=[-2, -1], ubu=[2, 3], lbx=[-5, -4], ubx=[5, 4], units={"thrust": "N", "p": "m"})
+    slow = nocl.limit_rates(system, {"thrust": 0.5})
+    assert slow.state_names == ("p", "v", "thrust")
+    assert slow.control_names == ("u", "thrust_rate")
+    assert (slow.lbu.tolist(), slow.ubu.tolist()) == ([-2, -0.5], [2, 0.5])
+    assert (slow.lbx.tolist(), slow.ubx.tolist()) == ([-5, -4, -1], [5, 4, 3])
+    np.testing.assert_allclose(slow.f([1, 2, 3], [0.5, 0.25], 2.0).full().ravel(), [2, 4, 0.25])
+    assert slow.unit("thrust") == "thrust [N]"
+
+
+@pytest.mark.parametrize(("rates", "said"), [({"q": 1}, "rates is .*names of controls .u."), ([1], "rates is"),
+                                             ({}, "rates is"), ({"u": 0}, "the rate of u is 0; expected a finite pos")])
+def test_rates_are_of_controls(rates, said):
+    with pytest.raises(ValueError, match=f"^limit_rates: {said}"):
+        nocl.limit_rates(CART, rates)

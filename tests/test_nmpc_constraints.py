@@ -1,4 +1,4 @@
-"""NMPC under constraints of controls, at the end, with a free horizon: analytic optima, programs written here, units."""
+"""NMPC under constraints of controls, at the end, with a free horizon: analytic optima, programs of its own, units."""
 
 import re
 from dataclasses import replace
@@ -300,3 +300,18 @@ def test_states_are_held_hard_by_bounds_as_by_path_constraints():
     assert a.cost == pytest.approx(b.cost, rel=1e-7)
     assert a.gain == pytest.approx(b.gain, abs=1e-4)
     assert a.x[:, :, 1].min() == pytest.approx(-0.3, abs=1e-6)
+
+
+def test_a_limit_of_the_rate_makes_a_jerk():
+    """p''' = j, |j| <= 1, from rest to rest in least time: j is -1, 1, -1 over T / 4, T / 2, T / 4, p(0) = T^3 / 32."""
+    slow = nocl.limit_rates(integrator().system, {"u": 1.0})
+    assert (slow.state_names, slow.control_names) == (("p", "v", "u"), ("u_rate",))
+    ends = {name: (0, e, 0) for name, e in zip(("p end", "v end", "u end"), (P, V, U), strict=True)}
+    ocp = nocl.OCP(slow, horizon=nocl.Free(0.5, 20), running=1.0, terminal=0.0, x_goal=[0, 0, 0], u_goal=[0],
+                   initial_states=nocl.Uniform([0.1, 0, 0], [2, 0, 0]), terminal_constraints=ends,
+                   state_bounds={"u": (-1, 1)})
+    s = solver(ocp).solve([0.25, 0.0, 0.0], **SERIAL)
+    assert s.cost[0] == pytest.approx(8**(1 / 3), rel=1e-6)
+    assert s.u[0, :, 0] == pytest.approx(np.repeat([-1, 1, -1], [5, 10, 5]), abs=1e-4)
+    rate = np.diff(s.x[0, :, 2]) / np.diff(s.t[0])
+    assert np.abs(rate).max() <= 1 + 1e-7

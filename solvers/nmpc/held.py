@@ -2,7 +2,7 @@
 
 At node 0 the rows that hold the control, since x_0 is given; at nodes 1 ... N-1 all rows along the trajectory; at node
 N those of x alone, and those of the end. A soft row has a slack s >= 0 in units of its scale, c + scale s >= 0, an
-equation two of both signs; each costs SOFT times the usual cost: the exact penalty, with which what can be held is held.
+equation two of both signs; each costs SOFT times the usual cost: the exact penalty, by which what can be held is held.
 """
 
 from __future__ import annotations
