@@ -410,14 +410,15 @@ class OCP:
         has no use of them, or not yet.
         """
         self.refuse_free(owner)
-        rows = self.functions.rows
-        beyond = [f"the {rows.title(i)} of the control" for i in range(rows.n_x, len(rows))]
-        beyond += [f"the {rows.title(i)}, an equation" for i in range(rows.n_h, rows.n_x)]
-        beyond += [f"the {one.title}" for one in self.held_at_end]
+        rows, beyond = self.functions.rows, dict[str, str]()  # name: what it is
+        for i in range(rows.n_h, len(rows)):
+            what = " of the control" if rows.of_u[i] else ", an equation"
+            beyond[rows.names[i]] = f"the {rows.title(i)}{what}"
+        beyond |= {one.name: f"the {one.title}" for one in self.held_at_end}
         if beyond:
             raise ValueError(f"{owner} takes inequalities of (x, t, p) alone as constraints, but the problem on "
-                             f"{self.system.name!r} has {', '.join(dict.fromkeys(beyond))}: {remedy}, or leave them "
-                             "out, dataclasses.replace(ocp, constraints={}, terminal_constraints={})")
+                             f"{self.system.name!r} has {', '.join(beyond.values())}: {remedy}, or leave them out, "
+                             f"ocp.without({', '.join(map(repr, beyond))})")
 
     def refuse_free(self, owner: str) -> None:
         """ValueError for a free horizon."""
@@ -426,26 +427,29 @@ class OCP:
                              f"{self.horizon!r}: solve it by NMPC, or give it one, dataclasses.replace(ocp, "
                              f"horizon={self.horizon.high:g})")
 
+    def without(self, *names: str) -> OCP:
+        """The problem without the constraints of these names; ValueError for names of none."""
+        unknown = [name for name in names if name not in self.constraint_names]
+        if unknown:
+            raise ValueError(f"OCP on {self.system.name!r}: without({', '.join(map(repr, unknown))}); expected names of "
+                             f"constraints ({', '.join(self.constraint_names) or 'there are none'})")
+        given = {field: {name: one for name, one in getattr(self, field).items() if name not in names}
+                 for field in ("constraints", "terminal_constraints", "state_bounds", "path_constraints", "scales")}
+        return replace(self, **given)
+
     @property
     def unconstrained(self) -> OCP:
         """The problem without its constraints; U stays."""
-        return self.with_constraints(lambda e: None)
+        return self.without(*self.constraint_names)
 
-    def with_constraints(self, made: Callable[[ca.SX], Any], **changed: Any) -> OCP:
-        """dataclasses.replace(self, **changed), expressions of constraints as `made` has them; None leaves one out."""
+    def with_constraints(self, made: Callable[[ca.SX], ca.SX], **changed: Any) -> OCP:
+        """dataclasses.replace(self, **changed), the expressions of constraints as `made` has them."""
         def each(given: Mapping[str, Any]) -> dict[str, Any]:
-            new = {name: (one, made(one.expression)) for name, one in given.items()}
-            return {name: Within(one.low, e, one.high) for name, (one, e) in new.items() if e is not None}
+            return {name: Within(one.low, made(one.expression), one.high) for name, one in given.items()}
 
         paths = {name: made(h) for name, h in self.path_constraints.items()}
-        kept: dict[str, Any] = {
-            "constraints": each(self.constraints), "terminal_constraints": each(self.terminal_constraints),
-            "path_constraints": {name: h for name, h in paths.items() if h is not None},
-            "state_bounds": {name: pair for name, pair in self.state_bounds.items()
-                             if made(self.system.x[self.system.state_names.index(name)]) is not None}}
-        names = {name for those in kept.values() for name in those}
-        return replace(self, scales={name: size for name, size in self.scales.items() if name in names}, **kept,
-                       **changed)
+        return replace(self, constraints=each(self.constraints), path_constraints=paths,
+                       terminal_constraints=each(self.terminal_constraints), **changed)
 
     def at(self, p: Any = None) -> OCP:
         """The problem with its parameters folded in as constants: p as [np] or by name, each of them."""

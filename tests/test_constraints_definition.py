@@ -231,6 +231,24 @@ def test_who_takes_no_such_thing_says_so(taker, kind):
         TAKERS[taker](make(**BEYOND[kind]))
 
 
+def test_constraints_are_left_out_by_name():
+    ocp = every(scales={"power": 0.25, "slow": 0.1, "v": 2.0})
+    less = ocp.without("power", "at goal", "v", "pillar")
+    assert less.constraint_names == ("track", "wall", "line", "tied", "slow")
+    assert dict(less.scales) == {"slow": 0.1}
+    assert ocp.unconstrained.constraint_names == ()
+    assert "ocp.without('line', 'power', 'tied', 'slow', 'at goal')" in refusal_of(DDP, ocp)
+    DDP(ocp.without("line", "power", "tied", "slow", "at goal"))
+    with pytest.raises(ValueError, match="without.'push'.; expected names of constraints"):
+        ocp.without("push")
+
+
+def refusal_of(taker, ocp):
+    with pytest.raises(ValueError, match="takes inequalities") as refused:
+        taker(ocp)
+    return str(refused.value)
+
+
 @pytest.mark.parametrize("taker", ["simulate", "compare", "NMPC.controller"])
 def test_a_free_horizon_has_no_judge_and_no_loop(taker):
     ocp = make(horizon=Free(0.5, 4))
