@@ -431,8 +431,8 @@ class OCP:
         """The problem without the constraints of these names; ValueError for names of none."""
         unknown = [name for name in names if name not in self.constraint_names]
         if unknown:
-            raise ValueError(f"OCP on {self.system.name!r}: without({', '.join(map(repr, unknown))}); expected names of "
-                             f"constraints ({', '.join(self.constraint_names) or 'there are none'})")
+            raise ValueError(f"OCP on {self.system.name!r}: without({', '.join(map(repr, unknown))}); expected names "
+                             f"of constraints ({', '.join(self.constraint_names) or 'there are none'})")
         given = {field: {name: one for name, one in getattr(self, field).items() if name not in names}
                  for field in ("constraints", "terminal_constraints", "state_bounds", "path_constraints", "scales")}
         return replace(self, **given)

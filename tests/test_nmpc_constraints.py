@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import nocl
+from nocl.cli import main
 from nocl.solvers import NMPC
 
 P, V, U = ca.SX.sym("p"), ca.SX.sym("v"), ca.SX.sym("u")
@@ -315,3 +316,48 @@ def test_a_limit_of_the_rate_makes_a_jerk():
     assert s.u[0, :, 0] == pytest.approx(np.repeat([-1, 1, -1], [5, 10, 5]), abs=1e-4)
     rate = np.diff(s.x[0, :, 2]) / np.diff(s.t[0])
     assert np.abs(rate).max() <= 1 + 1e-7
+
+
+FILE = """
+import casadi as ca
+import nocl
+
+p, v, u = ca.SX.sym("p"), ca.SX.sym("v"), ca.SX.sym("u")
+system = nocl.System("integrator", x=ca.vertcat(p, v), u=u, xdot=ca.vertcat(v, u), lbu=[-1], ubu=[1], lbx=[-5, -5],
+                     ubx=[5, 5])
+ocp = nocl.OCP(system, horizon=nocl.Free(0.5, 10), running=1.0, terminal=0.0, x_goal=[0, 0], u_goal=[0],
+               initial_states=nocl.Uniform([1, 0], [2, 0]), terminal_constraints={"p": (0, p, 0), "v": (0, v, 0)})
+"""
+
+
+def test_the_command_line_solves_a_free_horizon_and_trains_none(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "fast.py").write_text(FILE)
+    assert main(["solve", "fast.py", "--solver", "nmpc", "--n", "2", "--intervals", "20", "--out", "a"]) == 0
+    assert "2 of 2 solved" in capsys.readouterr().out
+    with np.load(tmp_path / "a" / "solutions" / "nmpc.npz") as data:
+        assert data["t"][:, -1] == pytest.approx(2 * np.sqrt(data["x0"][:, 0]), rel=1e-5)
+    for command in ("train", "run"):
+        assert main([command, "fast.py", "--out", "b"]) == 2
+        assert f"nocl {command} takes a number as horizon" in "".join(capsys.readouterr())
+
+
+def test_outcomes_are_kept_with_their_horizons(tmp_path):
+    """The second call finds what the first one left."""
+    nmpc = solver(integrator(**FASTEST))
+    first, again = (nmpc.solve([[1.0, 0.0], [1.5, 0.0]], out=tmp_path, **SERIAL) for _ in range(2))
+    for name in ("t", "x", "u", "cost", "V_x", "seconds"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
+
+
+def test_a_loop_holds_constraints_of_the_control():
+    """Closed loop, each control held for an interval: |u v| <= .12 where it acts."""
+    ocp = integrator(terminal=5 * (P**2 + V**2), constraints={"power": (-0.12, U * V, 0.12)})
+    loop = NMPC(ocp, 10, substeps=1, starts=2).controller()
+    run = nocl.simulate(ocp, loop, [0.8, 0.0], hold=10)
+    assert loop.failures == 0
+    plan = solver(ocp, 10).solve([0.8, 0.0], **SERIAL)
+    assert run.cost[0] == pytest.approx(plan.cost[0], rel=1e-2)
+    power = run.u[0, :-1, 0] * run.x[0, :-1, 1]
+    assert np.abs(power).max() <= 0.12 + 1e-6
+    assert np.abs(plan.u[0, :, 0] * plan.x[0, :-1, 1]).max() == pytest.approx(0.12, abs=1e-6)  # it binds
