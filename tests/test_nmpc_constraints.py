@@ -7,6 +7,8 @@ from functools import cache
 import casadi as ca
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import nocl
 from nocl.cli import main
@@ -265,9 +267,9 @@ def test_free_solutions_are_guesses_and_neighbours():
     for wrong in (s.u, lambda x, t: 0 * x[:, :1]):
         with pytest.raises(ValueError, match="which says no horizon, and that is free; expected a Solution"):
             solver(ocp).solve([[1.0, 0.0]], wrong, **SERIAL)
-    for given in ({"t0": 0.5}, {"nodes": np.linspace(0, 1, 21)}):
+    for fixed in ({"t0": 0.5}, {"nodes": np.linspace(0, 1, 21)}):
         with pytest.raises(ValueError, match="but the horizon is free; expected t0 = 0 and no nodes"):
-            solver(ocp).solve([[1.0, 0.0]], **given, **SERIAL)
+            solver(ocp).solve([[1.0, 0.0]], **fixed, **SERIAL)
     with pytest.raises(ValueError, match=r"horizon is 1.0, but that of the problem is Free"):
         NMPC(ocp, horizon=1.0)
 
@@ -361,3 +363,31 @@ def test_a_loop_holds_constraints_of_the_control():
     power = run.u[0, :-1, 0] * run.x[0, :-1, 1]
     assert np.abs(power).max() <= 0.12 + 1e-6
     assert np.abs(plan.u[0, :, 0] * plan.x[0, :-1, 1]).max() == pytest.approx(0.12, abs=1e-6)  # it binds
+
+
+NUMBERS = st.floats(-1, 1)
+
+
+@settings(max_examples=6, deadline=None, derandomize=True, database=None)
+@given(st.lists(st.tuples(NUMBERS, NUMBERS, NUMBERS, NUMBERS, st.floats(0.01, 0.3)), min_size=1, max_size=3), NUMBERS)
+def test_a_plan_that_holds_them_is_never_beaten_by_one_that_does_not(rows, push):
+    """Random quadratic constraints that some plan holds, at the nodes and at the end: a better one that holds them."""
+    N, x0 = 10, np.array([1.0, -0.2])
+    u = 0.6 * np.sin(push + np.arange(N) / 3)
+    nodes = np.array([[*x0]] * (N + 1))
+    for k in range(N):
+        nodes[k + 1] = nodes[k] + 0.2 * np.array([nodes[k, 1] + 0.1 * u[k], u[k]])
+
+    def constraint(c, p, v, w):
+        return c[0] * p + c[1] * v + c[2] * p * v + c[3] * v * w
+
+    most = [max(constraint(c, *x, w) for x, w in zip(nodes, [*u, 0.0], strict=True)) for c in rows]
+    held = {f"c{i}": (None, constraint(c, P, V, U), c[4] + high)
+            for i, (c, high) in enumerate(zip(rows, most, strict=True))}
+    ends = {"end": (nodes[-1, 0] - 0.05, P, nodes[-1, 0] + 0.05)}
+    ocp = integrator(constraints=held, terminal_constraints=ends, terminal=(P - 1)**2)
+    s = solver(ocp, N).solve(x0, u[None, :, None], starts=1, **SERIAL)
+    assert s.success[0], s.message[0]
+    assert ocp.functions.c(s.x[0, :-1].T, s.u[0].T).full().min() >= -1e-6
+    assert ocp.functions.c_end(s.x[0, -1]).full().min() >= -1e-6
+    assert s.cost[0] <= 0.2 * (u**2).sum() + (nodes[-1, 0] - 1)**2 + 1e-8
