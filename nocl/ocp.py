@@ -433,8 +433,9 @@ class OCP:
         if unknown:
             raise ValueError(f"OCP on {self.system.name!r}: without({', '.join(map(repr, unknown))}); expected names "
                              f"of constraints ({', '.join(self.constraint_names) or 'there are none'})")
-        given = {field: {name: one for name, one in getattr(self, field).items() if name not in names}
-                 for field in ("constraints", "terminal_constraints", "state_bounds", "path_constraints", "scales")}
+        given: dict[str, Any] = {
+            field: {name: one for name, one in getattr(self, field).items() if name not in names}
+            for field in ("constraints", "terminal_constraints", "state_bounds", "path_constraints", "scales")}
         return replace(self, **given)
 
     @property

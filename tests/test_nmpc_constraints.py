@@ -365,6 +365,20 @@ def test_a_loop_holds_constraints_of_the_control():
     assert np.abs(plan.u[0, :, 0] * plan.x[0, :-1, 1]).max() == pytest.approx(0.12, abs=1e-6)  # it binds
 
 
+@pytest.mark.parametrize("kind", ["path_constraints", "constraints"])
+def test_each_row_is_scaled_by_its_own_size(kind):
+    """A place in micrometres, a speed in m/s, and a limit of it in a unit of its own: costates in theirs."""
+    small = nocl.System("small", x=ca.vertcat(P, V), u=U, xdot=ca.vertcat(1e6 * V, U), lbu=[-1], ubu=[1],
+                        lbx=[-5e6, -5], ubx=[5e6, 5])
+    p = 1e-6 * P
+    ocp = nocl.OCP(small, horizon=2.0, running=U**2, terminal=p**2 + V**2, x_goal=[0, 0], u_goal=[0],
+                   initial_states=nocl.Uniform([0.5e6, -0.1], [2e6, 0.1]), **{kind: {"slow": 1e7 * (V + 0.3)}})
+    right = integrator(terminal=P**2 + V**2, state_bounds={"v": (-0.3, None)})
+    a, b = (solver(one).solve(x0, **SERIAL) for one, x0 in ((ocp, [1e6, 0.0]), (right, [1.0, 0.0])))
+    assert a.cost == pytest.approx(b.cost, rel=1e-6)
+    assert a.costate[0] * [1e6, 1] == pytest.approx(b.costate[0], abs=1e-4)
+
+
 NUMBERS = st.floats(-1, 1)
 
 
