@@ -35,6 +35,7 @@ PATH, ALONG, BOUND, END = "path constraint", "constraint", "state bound", "termi
 FORM = "an expression, which is held >= 0, or (low, expression, high), None for no bound, low = high for an equation"
 
 Places = dict[str, Array]  # x [n, nx], u [n, nu], t [n], p [n, np]
+Measure = Callable[[], tuple[Array, Array]]  # the scales of the rows along a trajectory, and of those at its end
 
 
 def limit_rates(system: System, rates: Mapping[str, float]) -> System:
@@ -367,6 +368,3 @@ def joined(rows: Rows, each: Array, given: Mapping[str, float]) -> Array:
 
 def _finite(c: Array) -> Array:
     return np.where(np.isfinite(c), c, 0.0)
-
-
-Measure = Callable[[], tuple[Array, Array]]  # the scales of the rows along a trajectory, and of those at its end

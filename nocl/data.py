@@ -100,7 +100,7 @@ class Solution:
     Rows: `solution[rows]`, `Solution.join`, `put`. In time: `solution(t)`, `solution.feedback(x, t)`.
     """
 
-    t: Array  # [B, K+1], the nodes
+    t: Array  # [B, K+1], the nodes; where the horizon is free, each row has its own
     x: Array  # [B, K+1, nx]; of a failed row NaN, or where its solver ended
     u: Array  # [B, K, nu], held over [t_k, t_k+1)
     gain: Array  # [B, K, nu, nx], du/dx; NaN also where there is no strict optimum
