@@ -109,16 +109,19 @@ class NMPC:
                                              and all(isinstance(key, str) for key in self.options)):
             raise ValueError(f"NMPC: options is {checks.shown(self.options)}; expected a dict of options of the "
                              'nlpsol by name, like {"ipopt.tol": 1e-6}')
-        if self.horizon is not None and self.ocp.is_free:
-            raise ValueError(f"NMPC: horizon is {self.horizon!r}, but that of the problem is {self.ocp.horizon!r}; "
-                             "expected one of them: leave it out")
-        if checks.number(self.window, "horizon", "NMPC", positive=True) > self.ocp.longest:
-            raise ValueError(f"NMPC: horizon is {self.horizon!r}; expected at most {self.ocp.longest:g}, the OCP's")
+        self._check_window()
         if self.time_limit is not None:
             checks.number(self.time_limit, "time_limit", "NMPC", positive=True)
         if self.dynamics is not None:
             object.__setattr__(self, "dynamics", dynamics_function(self.ocp, self.dynamics))
         object.__setattr__(self, "terminal", _terminal(self.ocp, self.terminal))
+
+    def _check_window(self) -> None:
+        if self.horizon is not None and self.ocp.is_free:
+            raise ValueError(f"NMPC: horizon is {self.horizon!r}, but that of the problem is {self.ocp.horizon!r}; "
+                             "expected one of them: leave it out")
+        if checks.number(self.window, "horizon", "NMPC", positive=True) > self.ocp.longest:
+            raise ValueError(f"NMPC: horizon is {self.horizon!r}; expected at most {self.ocp.longest:g}, the OCP's")
 
     def _check_soft(self) -> None:
         """ValueError for names of no constraints, and for the penalty where it says nothing of some."""

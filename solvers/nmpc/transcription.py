@@ -408,27 +408,20 @@ class Transcription:
             slacks[:, j] = np.maximum(np.sign(block.slack[i, j]) * need[i], 0.0)
 
     def _solve(self, x0: Array, t: Array, x: Array, u: Array, own: Array) -> Answer:
-        w0, nx = self._start(t, x, u, own), self.ocp.system.nx
-        ends = t / t[-1] if self.free else t
-        solver, p = self.solver, np.r_[x0, np.diff(ends), ends[-1], own]
-        scales = self.scales
+        w0, ends = self._start(t, x, u, own), t / t[-1] if self.free else t
         try:
-            result = solver(x0=w0 / scales.w, p=p, **self._limits)
+            result = self.solver(x0=w0 / self.scales.w, p=np.r_[x0, np.diff(ends), ends[-1], own], **self._limits)
         except RuntimeError as error:  # of the library: it fails one start, not the batch
             return self._no_answer(t, x, u, f"ended with an error: {str(error).strip().splitlines()[-1]}")
-        stats = solver.stats()
-        X, U, S = (v.full().T for v in self._split(result["x"] * scales.w))
-        if self.free:
-            t = ends * X[0, nx]
-            X = X[:, :nx]
-        U = np.clip(U, self.ocp.system.lbu, self.ocp.system.ubu)  # IPOPT relaxes bounds by 1e-8
-        costate = -result["lam_g"].full().ravel()[self.gap_rows] * scales.cost / scales.x
+        return self._answer(result, self.solver.stats(), ends, own)
+
+    def _answer(self, result: dict[str, ca.DM], stats: dict[str, Any], ends: Array, own: Array) -> Answer:
+        """What the solver found; ends: the nodes, as shares of T where that is free."""
+        X, U, t, cost = self._plan(result, ends, own)
+        costate = -result["lam_g"].full().ravel()[self.gap_rows] * self.scales.cost / self.scales.x
         worst, where = self.violation(result["g"].full().ravel(), t)
         iterations = int(stats.get("iter_count", 0))
         outcome = outcome_of(stats, iterations >= self.max_iter)
-        cost = float(result["f"]) * scales.cost
-        if self.held.slacks:  # of which the solver holds bounds by 1e-8 only
-            cost += self.held.weight * float((self.needed(t, X, U, own) - S).sum())
         finite = bool(np.isfinite(cost) and np.isfinite(X).all())
         if stats["success"] and not finite:  # fatrop calls a cost of NaN solved
             outcome = NOT_A_NUMBER
@@ -437,9 +430,19 @@ class Transcription:
         if not success:
             status += f"; worst violation {where}" if worst > FEASIBLE else \
                 ", at a feasible point that may not be optimal"
-        V_p = -result["lam_p"].full().ravel()[len(p) - len(own):] * scales.cost if len(own) else None
+        V_p = -result["lam_p"].full().ravel()[-len(own):] * self.scales.cost if len(own) else None
         return Answer(X, U, costate, cost if success else np.inf, success, status, worst, iterations, outcome, V_p,
                       t if self.free else None)
+
+    def _plan(self, result: dict[str, ca.DM], ends: Array, own: Array) -> tuple[Array, Array, Array, float]:
+        """(x [N+1, nx], u [N, nu], t [N+1], cost) of what the solver found."""
+        s, cost = self.ocp.system, float(result["f"]) * self.scales.cost
+        X, U, S = (v.full().T for v in self._split(result["x"] * self.scales.w))
+        U = np.clip(U, s.lbu, s.ubu)  # IPOPT relaxes bounds by 1e-8
+        X, t = X[:, :s.nx], ends * X[0, s.nx] if self.free else ends
+        if self.held.slacks:  # whose bounds it relaxes, too
+            cost += self.held.weight * float((self.needed(t, X, U, own) - S).sum())
+        return X, U, t, cost
 
     @property
     def max_iter(self) -> float:
