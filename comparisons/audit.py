@@ -44,6 +44,7 @@ def audit(report: Report, methods: Mapping[str, Any], model: Any = None) -> tupl
     """
     from nocl.support.threads import one_thread  # with torch
 
+    report.ocp.refuse_constraints("audit", "compare tells what it can")
     learned = None if model is None else dynamics_function(report.ocp, model)
     with one_thread():
         return tuple(_audit(report, judged, methods[judged.name], learned, getattr(model, "doubt", None))

@@ -71,6 +71,7 @@ def robustness(ocp: OCP, methods: Mapping[str, Any], x0: ArrayLike, variants: Ma
     variants : plants by name that the methods do not know, {"mass +20 %": system}: a System, an OCP (its system
         counts), a casadi.Function (x, u) -> xdot, or an object with `to_casadi()`
     """
+    ocp.refuse_constraints("robustness")
     rows, _ = checks.states(x0, ocp.system.nx, ocp.system.name)
     starts = Starts(rows.copy(), ocp.parameters_of(p, len(rows), "robustness"))
     return _Study(ocp, checked(methods), starts, settings or Disturbances(), workers,

@@ -30,6 +30,7 @@ class Reference:
     """
 
     def __init__(self, ocp: OCP, intervals: int, guesses: Sequence[Array] = ()) -> None:
+        ocp.refuse_constraints("Reference")
         self.ocp, self.intervals, self.guesses = ocp, intervals, list(guesses)
 
     def solve(self, x0: Array, p: Array | None = None) -> Solution:

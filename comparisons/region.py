@@ -35,6 +35,7 @@ def region(ocp: OCP, name: str, method: Any, scales: Sequence[float] = SCALES, n
     known: its own, or DDP's from cold starts, neighbours and the run itself. Every scale has the same draws, farther
     out.
     """
+    ocp.refuse_constraints("region")
     if not scales or min(scales) <= 0 or list(scales) != sorted(set(scales)):
         raise ValueError(f"scales is {scales!r}; expected rising numbers > 0, like (0.5, 1, 2)")
     states, good, p = list[Array](), list[Array](), ocp.sample_parameters(n, own_numbers(seed, 0, 1))

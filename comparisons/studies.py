@@ -43,6 +43,7 @@ def study(ocp: OCP, methods: Mapping[str, Any], n: int = 200, x0: ArrayLike | No
     The reference is DDP's on FINE intervals, from what each method found; it is judged like the others. With `out`
     solves and judged runs are kept; the reference, audits, optima under disturbances and regions are found anew.
     """
+    ocp.refuse_constraints("study")
     folder = None if out is None else Path(out)
     report = compare(ocp, methods, n, x0, seed, hold, workers, None if folder is None else folder / "compare", progress,
                      p)

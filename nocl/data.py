@@ -100,7 +100,7 @@ class Solution:
     Rows: `solution[rows]`, `Solution.join`, `put`. In time: `solution(t)`, `solution.feedback(x, t)`.
     """
 
-    t: Array  # [B, K+1], the nodes
+    t: Array  # [B, K+1], the nodes; where the horizon is free, each row has its own
     x: Array  # [B, K+1, nx]; of a failed row NaN, or where its solver ended
     u: Array  # [B, K, nu], held over [t_k, t_k+1)
     gain: Array  # [B, K, nu, nx], du/dx; NaN also where there is no strict optimum
@@ -114,10 +114,11 @@ class Solution:
     V_xx: Array | None = None  # [B, K+1, nx, nx]
     tried: Array | None = None  # [B, n], the cost that each start ended at: inf, it failed; NaN, there were fewer
     unit: Array | None = None  # [B], what costs of the problem usually are
-    clearance: Array | None = None  # [B], min of all path constraints at the nodes; inf where there are none
+    clearance: Array | None = None  # [B], min of all constraints at the nodes, as Simulation has it; inf: there is none
     dense: Array | None = None  # [B, K, 4, 2 nx]: (x, costate) at both ends of intervals, their time derivatives
     p: Array | None = None  # [B, np], the parameters of each problem; None where it has none
     V_p: Array | None = None  # [B, np], dJ*/dp; None where there are no parameters
+    slack: Array | None = None  # [B, K+1, n], by how much each of NMPC's n soft constraints is exceeded, in its scale
 
     def __len__(self) -> int:
         return len(self.cost)

@@ -1,4 +1,4 @@
-"""The one door to a problem's functions: f, L, L_soft, h, G and what is derived from them, by name.
+"""The one door to a problem's functions: f, L, L_soft, h, G, constraints and what is derived from them, by name.
 
 A stage is one moment of a problem: f and L stand there as functions of (x, u). A node is where path constraints hold,
 h(x), and the end is where G(x) does. What acts on the problem, a policy or a value, is a function of (x, t). Each of
@@ -11,6 +11,11 @@ h holds the time has t in its stage and node; one with parameters has p, all of 
     at.xdot, at.L, at.L_soft, at.interval(h)                              # expressions in the stage's symbols
     at.function("H_u", {"H_u": ca.gradient(H, at.u)}, costate=costate)    # of (x, u, costate)
     ocp.functions.on(f_theta.to_casadi())                                 # the same problem under another f
+    ocp.functions.rows, .c, .end_rows, .c_end                             # all constraints, scaled: c >= 0, or c = 0
+
+h is the inequalities of (x, t, p) alone, in their own units. All constraints stand in `rows` (along a trajectory) and
+`end_rows` (at its end), which say of each row whose it is, its side, whether it is an equation and whether it holds u;
+c and c_end are their values as shares of each constraint's scale.
 
 So an argument that f or L gains is written here, and where callers have its data.
 """
@@ -24,8 +29,10 @@ from typing import Any
 
 import casadi as ca
 
+from nocl.constraints import PATH, Measure, Rows
 from nocl.parameters import TIME, time
 from nocl.support import checks
+from nocl.support.checks import Array
 from nocl.system import System
 from nocl.translate.arguments import Arguments
 from nocl.translate.rk4 import rk4_cost
@@ -37,9 +44,12 @@ class Functions:
 
     system: System
     running: ca.SX  # L(x, u)
-    soft: ca.SX  # L_soft(x, u)
-    constraints: ca.SX  # h(x), a column
+    rows: Rows  # constraints along a trajectory, of (x, u)
+    end_rows: Rows  # ... at its end, of x
     terminal: ca.SX  # G(x)
+    measured: Measure  # the scales of both kinds of rows
+    penalty: float  # of L_soft, and its margin
+    penalty_margin: float
     dynamics: ca.Function | None = None  # (x, u[, t][, p of the system]) -> xdot in place of the system's own f
     p: ca.SX = field(default_factory=lambda: ca.SX(0, 1))  # the problem's own parameters
 
@@ -50,9 +60,8 @@ class Functions:
 
     @cached_property
     def timed(self) -> bool:
-        """Whether f, L or h holds the time."""
-        t = time()
-        return self.system.uses_time or bool(ca.depends_on(ca.vertcat(self.soft, self.constraints), t))
+        """Whether f, L or a constraint holds the time."""
+        return self.system.uses_time or bool(ca.depends_on(ca.vertcat(self.running, self.rows.column), time()))
 
     @cached_property
     def arguments(self) -> Arguments:
@@ -71,6 +80,36 @@ class Functions:
         if self.dynamics is None or self.dynamics.is_a("SXFunction"):
             return Stage(own.symbols, self)
         return Stage(Arguments.new(ca.MX, **{n: s.numel() for n, s in own.symbols.items()}).symbols, self)
+
+    @cached_property
+    def scales(self) -> Array:
+        """What each of `rows` is measured by [m] > 0."""
+        return self.measured()[0]
+
+    @cached_property
+    def end_scales(self) -> Array:
+        """What each of `end_rows` is measured by [m] > 0."""
+        return self.measured()[1]
+
+    @cached_property
+    def constraints(self) -> ca.SX:
+        """h(x), a column, in the users' own units."""
+        return self.rows.column[:self.rows.n_h]
+
+    @cached_property
+    def penalised(self) -> list[ca.SX]:
+        """h(x), one by one, as `penalty_margin` is meant: path constraints in their own unit, others in their scale."""
+        h = ca.vertsplit(self.constraints) if self.rows.n_h else []
+        return [one if of.kind == PATH else one / float(self.scales[i])
+                for i, (of, one) in enumerate(zip(self.rows.of, h, strict=False))]
+
+    @cached_property
+    def soft(self) -> ca.SX:
+        """L_soft(x, u)"""
+        soft = self.running
+        for h in self.penalised:
+            soft = soft + self.penalty * ca.fmax(self.penalty_margin - h, 0) ** 2
+        return soft
 
     @property
     def node(self) -> Arguments:
@@ -135,8 +174,34 @@ class Functions:
 
     @cached_property
     def h(self) -> ca.Function:
-        """(x[, t][, p]) -> path constraints [number of them], each >= 0 where it holds."""
+        """(x[, t][, p]) -> inequalities of these alone [number of them], each >= 0 where it holds, in its own unit."""
         return self.node.function("h", {"h": self.constraints})
+
+    @cached_property
+    def c_of_x(self) -> ca.Function:
+        """(x[, t][, p]) -> the rows of these alone, in their own units: h, then equations."""
+        n = self.rows.n_x
+        return self.h if n == self.rows.n_h else self.node.function("c_of_x", {"c": self.rows.column[:n]})
+
+    @cached_property
+    def c_of_u(self) -> ca.Function:
+        """(x, u[, t][, p]) -> the rows that hold the control, in their own units."""
+        return self.arguments.function("c_of_u", {"c": self.rows.column[self.rows.n_x:]})
+
+    @cached_property
+    def c_at_end(self) -> ca.Function:
+        """(x[, p]) -> the rows at the end, in their own units."""
+        return self.end.function("c_at_end", {"c": self.end_rows.column})
+
+    @cached_property
+    def c(self) -> ca.Function:
+        """(x, u[, t][, p]) -> all rows along a trajectory, as shares of their scales: >= 0, or = 0 (`rows.equal`)."""
+        return self.arguments.function("c", {"c": ca.densify(self.rows.column / ca.DM(self.scales))})
+
+    @cached_property
+    def c_end(self) -> ca.Function:
+        """(x[, p]) -> all rows at the end, as shares of their scales."""
+        return self.end.function("c_end", {"c": ca.densify(self.end_rows.column / ca.DM(self.end_scales))})
 
     @cached_property
     def G(self) -> ca.Function:

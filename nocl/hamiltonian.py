@@ -20,12 +20,14 @@ FACES = 4  # most controls that are coupled in H for all 3^nu faces to be writte
 
 def hamiltonian(ocp: OCP) -> ca.Function:
     """(x, u, costate) -> H = L + costate'f with path constraints as OCP.L_soft has them, a scalar."""
+    ocp.refuse_constraints("hamiltonian")
     at, costate = ocp.functions.stage, ca.SX.sym("costate", ocp.system.nx)
     return at.function("hamiltonian", {"H": at.hamiltonian(costate)}, costate=costate)
 
 
 def minimiser(ocp: OCP) -> ca.Function | None:
     """(x, costate) -> (u*, H there), exact; None where H is not quadratic in u, or couples more than FACES controls."""
+    ocp.refuse_constraints("minimiser")
     s, at, costate = ocp.system, ocp.functions.stage, ca.SX.sym("costate", ocp.system.nx)
     H: Any = at.hamiltonian(costate)
     Q, g = ca.hessian(H, at.u)

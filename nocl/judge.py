@@ -10,8 +10,8 @@ Three kinds of control are judged alike:
 
 On a problem with parameters they are functions of (x, t, p), p [B, np]; those of a problem without, of (x, t).
 
-The judge clips every control to U, and starts CVODES anew wherever a control or a state jumps. Path constraints are
-judged between the nodes too, at BETWEEN times in each interval.
+The judge clips every control to U, and starts CVODES anew wherever a control or a state jumps. Constraints are judged
+between the nodes too, at BETWEEN times in each interval, those that hold the control under the one that acts there.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from nocl.translate.arguments import Arguments
 
 Kicks = Sequence[tuple[float, ArrayLike]]
 MULTISTEP = ("adams", "bdf")  # the second, for stiff loops, where the first gives up; same tolerances
-BETWEEN = 8  # times in an interval that path constraints are judged at
+BETWEEN = 8  # times in an interval that constraints are judged at
 AT_BOUND = 1e-9  # of the width of U: closer than this counts as saturated
 
 
@@ -53,7 +53,8 @@ class Simulation:
     terminal_error: Array  # [B], ||x(T) - x*||_2, x* the nearest image of the goal (OCP.from_goal)
     control_magnitude: Array  # [B], mean of ||u||_2 over time
     saturation: Array  # [B], share of time with a control at a bound
-    clearance: Array  # [B], min of all path constraints, at and between nodes; inf if the problem has none
+    clearance: Array  # [B], min of all constraints, at and between nodes, and at the end, in units of their scales; of
+    # a problem with path constraints alone in their own units; inf if there are none
     violation: Array  # [B], the largest of any, as a share of that constraint's own scale (OCP.violation); 0: none
     success: Array  # [B] bool
     message: Sequence[str]  # [B], "" or what failed, at which time and state
@@ -77,9 +78,11 @@ def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: i
         first control is there at once: where a run starts is known before it does
     t0 : start, so that a tail of the horizon can be judged
 
-    Raises ValueError for shapes that do not fit. A state that blows up or a NaN control is a row with success False.
+    Raises ValueError for shapes that do not fit, and for a problem whose horizon is free. A state that blows up or a
+    NaN control is a row with success False.
     """
     checks.problem(ocp, "simulate")
+    ocp.refuse_free("simulate")
     check_made_for(ocp, controller, "the controller")
     rows, _ = checks.states(x0, ocp.system.nx, ocp.system.name)
     t0 = _check_options(ocp, hold, nodes, t0)
@@ -377,17 +380,26 @@ class _Judge:
                     magnitude[i] += magnitude_i
         z[:, :nx] += sum(dx for time, dx in jumps if time == t[-1])
         x[:, -1] = z[:, :nx]
-        least, x, t = self.ocp.least(x, t, self.p), x[:, ::m].copy(), nodes
-        p = [np.repeat(self.p, len(t), axis=0).T] if self.ocp.np else []
-        u = policy(x.reshape(-1, nx).T, np.tile(t, B)[None], *p).full().T.reshape(B, len(t), -1)
-        u = np.clip(u, self.ocp.system.lbu, self.ocp.system.ubu)
+        if self.ocp.states_only:
+            least = self.ocp.least(x, t, self.p)
+        else:
+            least = self.ocp.least_held(x, self.answers(policy, x, t), t, self.p)
+        x, t = x[:, ::m].copy(), nodes
+        u = self.answers(policy, x, t)
         weight = np.gradient(t) * np.r_[0.5, np.ones(len(t) - 2), 0.5] if len(t) > 2 else np.diff(t).repeat(2) / 2
         saturation = self.at_bound(u) @ (weight / weight.sum())
         return self.score(t, x, u, z[:, -1], magnitude / (t[-1] - t[0]), saturation, least, message)
 
+    def answers(self, policy: ca.Function, x: Array, t: Array) -> Array:
+        """The policy's controls [B, n, nu] at states x [B, n, nx] of times t [n], in U."""
+        B, s = len(x), self.ocp.system
+        p = [np.repeat(self.p, len(t), axis=0).T] if self.ocp.np else []
+        u = policy(x.reshape(-1, s.nx).T, np.tile(t, B)[None], *p).full().T.reshape(B, len(t), -1)
+        return np.clip(u, s.lbu, s.ubu)
+
     def held(self, ask: Ask, x0: Array, t: Array, jumps: list[tuple[float, Array]], delay: float = 0.0) -> Simulation:
         B, nx, K, nu = len(x0), x0.shape[1], len(t) - 1, self.ocp.system.nu
-        step, least = _Step(self), np.full((B, len(self.ocp.path_constraints)), np.inf)
+        step, least = _Step(self), np.full((B, len(self.ocp.functions.rows)), np.inf)
         x, u = np.full((B, K + 1, nx), np.nan), np.full((B, K + 1, nu), np.nan)
         z, message = np.c_[x0, np.zeros(B)], [""] * B
         for k in range(K):
@@ -402,13 +414,28 @@ class _Judge:
             edges = np.unique(np.r_[t[k], [time for time, _ in middle], min(late, t[k + 1]), t[k + 1]])
             for a, b in pairwise(edges):
                 z[:, :nx] += sum(dx for time, dx in middle if time == a)
-                path = step.run(z, u[:, k - 1] if a < late else u[:, k], a, b, message)
-                least = np.minimum(least, self.ocp.least(path, a + (b - a) * step.grid, self.p))
+                acts, start = u[:, k - 1] if a < late else u[:, k], z[:, None, :nx].copy()
+                path = step.run(z, acts, a, b, message)
+                least = np.minimum(least, self.under(acts, start, path, a + (b - a) * np.r_[0.0, step.grid]))
         z[:, :nx] += sum(dx for time, dx in jumps if time == t[-1])
         x[:, -1], u[:, -1] = z[:, :nx], u[:, -2]
         magnitude = np.linalg.norm(u[:, :-1], axis=2).mean(axis=1)
-        least = np.minimum(least, self.ocp.least(x, t, self.p))
+        least = np.minimum(least, self.at_nodes(x, u, t))
         return self.score(t, x, u, z[:, -1], magnitude, self.at_bound(u[:, :-1]).mean(axis=1), least, message)
+
+    def under(self, u: Array, start: Array, path: Array, t: Array) -> Array:
+        """Least values of the constraints on the way from `start` [B, 1, nx] along `path` [B, m, nx] under u [B, nu];
+        t [m + 1] are the times of both."""
+        if self.ocp.states_only:
+            return self.ocp.least(path, t[1:], self.p)
+        x = np.concatenate([start, path], axis=1)
+        return self.ocp.least_held(x, np.repeat(u[:, None], len(t), axis=1), t, self.p)
+
+    def at_nodes(self, x: Array, u: Array, t: Array) -> Array:
+        """Those at the nodes; constraints that hold the control were looked at on the way."""
+        if self.ocp.states_only:
+            return self.ocp.least(x, t, self.p)
+        return self.ocp.least_held(x, u[:, :0], t, self.p)
 
     def at_bound(self, u: Array) -> Array:
         """Whether any control is at a bound, [B, K], as 0 or 1."""
@@ -419,7 +446,7 @@ class _Judge:
     @property
     def between(self) -> int:
         """Times in an interval that the state is recorded at."""
-        return BETWEEN if self.ocp.path_constraints else 1
+        return BETWEEN if self.ocp.held else 1
 
     def score(self, t: Array, x: Array, u: Array, running: Array, magnitude: Array, saturation: Array,
               least: Array, message: list[str]) -> Simulation:
@@ -430,9 +457,10 @@ class _Judge:
         running = np.where(success, running, np.inf)
         error = np.where(success, np.linalg.norm(ocp.from_goal(x[:, -1], self.p), axis=1), np.inf)
         u[~np.isfinite(x).all(axis=2)] = np.nan
+        at_end = ocp.least_at_end(x[:, -1], self.p)
         return Simulation(t, x, u, running + terminal, running, terminal, error, np.where(success, magnitude, np.nan),
-                          np.where(success, saturation, np.nan), least.min(axis=1, initial=np.inf),
-                          self.ocp.violation(least), success, message)
+                          np.where(success, saturation, np.nan), ocp.nearest(least, at_end),
+                          ocp.violation(least, at_end), success, message)
 
 
 class _Segment:

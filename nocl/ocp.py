@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from types import MappingProxyType
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
+from nocl import constraints as limits
 from nocl import parameters as known
 from nocl import pretty, sampling
-from nocl.clearance import scales
+from nocl.constraints import ALONG, BOUND, END, PATH, Constraint, Free, Places, Rows, Within
 from nocl.functions import Functions
 from nocl.sampling import Distribution, Gaussian, Seed, Uniform, box, short
 from nocl.smoothness import kinks, linear_controls
@@ -33,7 +33,7 @@ N_IMAGES, SAME_IMAGE = 16, 1e-9  # points of the box; relative to usual values, 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class OCP:
-    """min_u int_0^T L(x, u) dt + G(x(T)), subject to xdot = f(x, u), u in U, h(x) >= 0.
+    """min_u int_0^T L(x, u) dt + G(x(T)), subject to xdot = f(x, u), u in U, and constraints along the way and at T.
 
     f, L and h may hold the time t = nocl.time() and parameters p, G parameters: f(x, u, t, p), L(x, u, t, p), G(x, p),
     h(x, t, p). The order of p is the system's parameters, then the problem's own.
@@ -41,8 +41,8 @@ class OCP:
     Parameters
     ----------
     system : System
-    horizon : float
-        T, in the system's unit of time (seconds for those that come with nocl).
+    horizon : float or nocl.Free
+        T, in the system's unit of time (seconds for those that come with nocl); nocl.Free(low, high): T is to be found.
     running, terminal : casadi.SX
         L(x, u) and G(x), scalars in the system's own symbols; t in G is the horizon.
     x_goal, u_goal : [nx], [nu]
@@ -56,10 +56,22 @@ class OCP:
     parameters : Gaussian or Uniform
         Of all parameters, the system's first, where there are any. Their nominal values are those that the parameters
         were given, or else its centre.
+    constraints : mapping from names to casadi.SX, or to (low, casadi.SX, high)
+        What holds along the trajectory: e(x, u, t, p) >= 0, or low <= e <= high, where None is no bound and low = high
+        an equation: {"track": (-0.5, x[0], 0.5), "wall": x[1] + 2, "thrust": (None, ca.sumsqr(u), 4)}. The box X of the
+        system is where samples are drawn from, and holds no trajectory: bounds of states are constraints.
+    terminal_constraints : likewise, of (x, p)
+        What holds at T.
+    state_bounds : mapping from names of states to (low, high)
+        Constraints of these names, {"v": (-2, 2)}.
+    scales : mapping from names of constraints to numbers > 0
+        What violations, margins and tolerances of a constraint are shares of, in its own unit. Default: found from X, U
+        and where the problem takes place (nocl/constraints.py).
     path_constraints : mapping from names to casadi.SX
-        Each h(x), in the unit of a distance, must be >= 0 along the trajectory (an obstacle: distance minus radius).
+        `constraints` of (x, t, p) alone, each >= 0 (an obstacle: distance minus radius), by their former name.
     penalty, penalty_margin : float
-        Where constraints are soft (training, DDP), penalty * max(margin - h, 0)^2 is added to L for each.
+        Where constraints are soft (training, DDP), penalty * max(margin - c, 0)^2 is added to L for each inequality of
+        (x, t, p), c being a path constraint in its own unit, and any other one as a share of its scale.
 
     Raises
     ------
@@ -68,7 +80,7 @@ class OCP:
     """
 
     system: System
-    horizon: float = field(kw_only=True)
+    horizon: Any = field(kw_only=True)
     running: ca.SX = field(kw_only=True)
     terminal: ca.SX = field(kw_only=True)
     x_goal: Vector = field(kw_only=True)
@@ -76,6 +88,10 @@ class OCP:
     initial_states: Distribution = field(kw_only=True)
     p: Any = field(default=None, kw_only=True)
     parameters: Distribution | None = field(default=None, kw_only=True)
+    constraints: Mapping[str, Any] = field(default_factory=dict, kw_only=True)
+    terminal_constraints: Mapping[str, Any] = field(default_factory=dict, kw_only=True)
+    state_bounds: Mapping[str, Any] = field(default_factory=dict, kw_only=True)
+    scales: Mapping[str, float] = field(default_factory=dict, kw_only=True)
     path_constraints: Mapping[str, ca.SX] = field(default_factory=dict, kw_only=True)
     penalty: float = field(default=300.0, kw_only=True)
     penalty_margin: float = field(default=0.005, kw_only=True)
@@ -84,7 +100,8 @@ class OCP:
         checks.instance(System, self.system, "system", "OCP")
         s, owner = self.system, f"OCP on {self.system.name!r}"
         for name in ("horizon", "penalty", "penalty_margin"):
-            self._set(**{name: checks.number(getattr(self, name), name, owner, positive=name == "horizon")})
+            if not isinstance(getattr(self, name), Free):
+                self._set(**{name: checks.number(getattr(self, name), name, owner, positive=name == "horizon")})
         self._set(p=known.column(self.p, owner))
         check_unique((*s.names, *self.parameter_names), False, owner)
         t, p = known.time(), self._all_p
@@ -97,6 +114,7 @@ class OCP:
         self._check_goal(owner)
         self._check_initial_states(owner)
         self._check_finite(owner)
+        self._check_possible(owner)
         if self.kinks:
             warnings.warn(f"{owner}: {self.not_smooth}", UserWarning, stacklevel=3)
 
@@ -105,13 +123,47 @@ class OCP:
             object.__setattr__(self, key, value)
 
     def _check_constraints(self, owner: str) -> None:
-        if not isinstance(self.path_constraints, Mapping) or not all(isinstance(n, str) for n in self.path_constraints):
-            raise ValueError(f"{owner}: path_constraints is {self.path_constraints!r}; expected a dict from names to "
-                             "expressions that are >= 0 where they hold, {'wall': 2 - p}")
-        x, u, t = ca.vertcat(self.system.x, self._all_p), self.system.u, known.time()
-        self._set(path_constraints=MappingProxyType(
-            {name: checks.expression(h, 1, x, f"path constraint {name!r}", owner, u, time=t)
-             for name, h in self.path_constraints.items()}))
+        s, t = self.system, known.time()
+        x, z = ca.vertcat(s.x, self._all_p), ca.vertcat(s.x, s.u, self._all_p)
+        self._set(constraints=limits.read(self.constraints, "constraints", ALONG, owner, z, None, t),
+                  path_constraints=limits.read_paths(self.path_constraints, owner, x, s.u, t),
+                  state_bounds=limits.read_bounds(self.state_bounds, owner, s.state_names),
+                  terminal_constraints=limits.read(self.terminal_constraints, "terminal_constraints", END, owner, x,
+                                                   s.u, t))
+        limits.check_unique((*self.held, *self.held_at_end), owner)
+        self._set(scales=limits.read_scales(self.scales, owner, self.constraint_names))
+        for what, e in (("terminal", self.terminal), *((one.title, one.expression) for one in self.held_at_end)):
+            if self.is_free and isinstance(e, ca.SX) and ca.depends_on(e, t):
+                raise ValueError(f"{owner}: {what} holds the time, which is the horizon there, and that is free; "
+                                 "expected an expression of x and p: give the running cost what T costs, running=1.0")
+
+    @cached_property
+    def held(self) -> tuple[Constraint, ...]:
+        """What is held along the trajectory."""
+        x = dict(zip(self.system.state_names, ca.vertsplit(self.system.x), strict=True))
+        return (*(Constraint(name, ALONG, *one) for name, one in self.constraints.items()),
+                *(Constraint(name, PATH, 0.0, h, np.inf) for name, h in self.path_constraints.items()),
+                *(Constraint(name, BOUND, low, x[name], high) for name, (low, high) in self.state_bounds.items()))
+
+    @cached_property
+    def held_at_end(self) -> tuple[Constraint, ...]:
+        """What is held at the end of the trajectory."""
+        return tuple(Constraint(name, END, *one) for name, one in self.terminal_constraints.items())
+
+    @property
+    def constraint_names(self) -> tuple[str, ...]:
+        """All that scales and soft constraints may be given for."""
+        return tuple(one.name for one in (*self.held, *self.held_at_end))
+
+    @property
+    def is_free(self) -> bool:
+        """Whether the horizon is to be found."""
+        return isinstance(self.horizon, Free)
+
+    @property
+    def longest(self) -> float:
+        """The horizon, or the longest that it may be."""
+        return float(self.horizon.high if self.is_free else self.horizon)
 
     def _check_parameters(self, owner: str) -> None:
         d, names = self.parameters, self.parameter_names
@@ -169,7 +221,7 @@ class OCP:
 
     def moments(self, n: int, seed: int = 0) -> dict[str, Array]:
         """n random times in [0, T] and parameters, as {"t": [n], "p": [n, np]}: for what is found out by trying."""
-        return {"t": sampling.own_numbers(seed, 1).uniform(0, self.horizon, n),
+        return {"t": sampling.own_numbers(seed, 1).uniform(0, self.longest, n),
                 "p": self.sample_parameters(n, sampling.own_numbers(seed, 2))}
 
     def _check_initial_states(self, owner: str) -> None:
@@ -194,7 +246,8 @@ class OCP:
         at["p"][0], inputs = self.nominal, [z, t, self._all_p]
         values_of = [np.vstack([x, self.goals(at["p"])[1].T]), at["t"][None], at["p"].T]
         for what, value in [("running", self.running), ("terminal", self.terminal),
-                            *((f"path constraint {name!r}", h) for name, h in self.path_constraints.items())]:
+                            *((one.title, one.expression) for one in (*self.held, *self.held_at_end)
+                              if one.kind != BOUND)]:
             check_scalar(ca.Function("e", inputs, [value]), f"{owner}: {what}")
             hessian, gradient = ca.hessian(value, z)
             for order, e in (("", value), ("the gradient of ", gradient), ("the second derivative of ", hessian)):
@@ -207,6 +260,33 @@ class OCP:
                                      "it as sqrt(d^2 + 1e-6)")
         if self.system.np or self.system.uses_time:
             self._check_equations(owner)
+
+    def _check_possible(self, owner: str) -> None:
+        """Try whether each constraint can be held somewhere in X x U; path constraints were never asked."""
+        along = [one for one in self.held if one.kind != PATH]
+        of, at_end = self.functions, [replace(one, expression=self._at_end(one.expression)) for one in self.held_at_end]
+        for these, at, bounds in ((along, of.arguments, self._box), (at_end, of.end, self._box_of_x)):
+            rows = Rows.made(these, self.system.u)
+            limits.check_possible(rows, at, self._samples(limits.TRIED), bounds, owner)
+
+    @property
+    def _box_of_x(self) -> tuple[Array, Array]:
+        return self.system.lbx, self.system.ubx
+
+    @property
+    def _box(self) -> tuple[Array, Array]:
+        """(lower, upper) of (x, u)."""
+        s = self.system
+        return np.r_[s.lbx, s.lbu], np.r_[s.ubx, s.ubu]
+
+    def _samples(self, n: int) -> Places:
+        """n points of X x U, with times and parameters."""
+        s, rng = self.system, np.random.default_rng(0)
+        return {"x": rng.uniform(s.lbx, s.ubx, (n, s.nx)), "u": rng.uniform(s.lbu, s.ubu, (n, s.nu)), **self.moments(n)}
+
+    def _at_end(self, e: ca.SX) -> ca.SX:
+        """An expression at the end, where the time is the horizon."""
+        return ca.substitute(e, known.time(), self.horizon) if ca.depends_on(e, known.time()) else e
 
     def _check_equations(self, owner: str) -> None:
         """Try f and its Jacobian at random states, controls, times and parameters."""
@@ -226,10 +306,11 @@ class OCP:
 
     @cached_property
     def kinks(self) -> tuple[str, ...]:
-        """Where L, G or a path constraint is not smooth, in words."""
+        """Where L, G or a constraint is not smooth, in words."""
         z, every = ca.vertcat(self.system.x, self.system.u), ca.vertcat(*self.functions.arguments.inputs)
         parts = {"the running cost": self.running, "the terminal cost": self.functions.terminal,
-                 **{f"path constraint {name!r}": h for name, h in self.path_constraints.items()}}
+                 **{one.title: self._at_end(one.expression) if one.kind == END else one.expression
+                    for one in (*self.held, *self.held_at_end)}}
         return tuple(f"{what} has {kink}" for what, e in parts.items() for kink in kinks(e, every, *self.stage_box, z))
 
     @property
@@ -252,7 +333,8 @@ class OCP:
 
         def values(x: Array) -> Array:
             stage, node, end = (a.columns(x=x.T, u=u.T, **at) for a in (of.arguments, of.node, of.end))
-            return np.vstack([v.full() for v in (of.f(*stage), of.L(*stage), of.G(*end), of.h(*node))])
+            held = [of.h(*node)] if self.states_only else [of.c(*stage), of.c_end(*end)]
+            return np.vstack([v.full() for v in (of.f(*stage), of.L(*stage), of.G(*end), *held)])
 
         here = values(x)
         usual = np.abs(here).max(axis=1, keepdims=True)
@@ -287,14 +369,14 @@ class OCP:
     def stage_box(self) -> tuple[Array, Array]:
         """(lower, upper) of (x, u[, t][, p]): X, U, [0, T] and where `parameters` lie."""
         s = self.system
-        time = ([0.0], [self.horizon]) if self.uses_time else ([], [])
+        time = ([0.0], [self.longest]) if self.uses_time else ([], [])
         p = self.parameter_box
         return np.r_[s.lbx, s.lbu, time[0], p[0]], np.r_[s.ubx, s.ubu, time[1], p[1]]
 
     @cached_property
     def uses_time(self) -> bool:
-        """Whether f, L or a path constraint holds the time."""
-        parts = ca.vertcat(self.running, *self.path_constraints.values())
+        """Whether f, L or a constraint holds the time."""
+        parts = ca.vertcat(self.running, *(one.expression for one in self.held))
         return self.system.uses_time or bool(ca.depends_on(parts, known.time()))
 
     def unit(self, name: str) -> str:
@@ -318,6 +400,58 @@ class OCP:
             of = f"problem on {self.system.name!r}"
             raise ValueError(refusal(owner, of, self.parameter_names, self.uses_time, "ocp"))
 
+    @property
+    def states_only(self) -> bool:
+        """Whether all constraints are inequalities of (x, t, p) along the trajectory: those that `h` has."""
+        return len(self.functions.rows) == self.functions.rows.n_h and not self.held_at_end
+
+    def refuse_constraints(self, owner: str, remedy: str = "solve it by NMPC") -> None:
+        """ValueError for constraints that hold a control, equations, terminal constraints and a free horizon: for what
+        has no use of them, or not yet.
+        """
+        self.refuse_free(owner)
+        rows, beyond = self.functions.rows, dict[str, str]()  # name: what it is
+        for i in range(rows.n_h, len(rows)):
+            what = " of the control" if rows.of_u[i] else ", an equation"
+            beyond[rows.names[i]] = f"the {rows.title(i)}{what}"
+        beyond |= {one.name: f"the {one.title}" for one in self.held_at_end}
+        if beyond:
+            raise ValueError(f"{owner} takes inequalities of (x, t, p) alone as constraints, but the problem on "
+                             f"{self.system.name!r} has {', '.join(beyond.values())}: {remedy}, or leave them out, "
+                             f"ocp.without({', '.join(map(repr, beyond))})")
+
+    def refuse_free(self, owner: str) -> None:
+        """ValueError for a free horizon."""
+        if self.is_free:
+            raise ValueError(f"{owner} takes a number as horizon, but that of the problem on {self.system.name!r} is "
+                             f"{self.horizon!r}: solve it by NMPC, or give it one, dataclasses.replace(ocp, "
+                             f"horizon={self.horizon.high:g})")
+
+    def without(self, *names: str) -> OCP:
+        """The problem without the constraints of these names; ValueError for names of none."""
+        unknown = [name for name in names if name not in self.constraint_names]
+        if unknown:
+            raise ValueError(f"OCP on {self.system.name!r}: without({', '.join(map(repr, unknown))}); expected names "
+                             f"of constraints ({', '.join(self.constraint_names) or 'there are none'})")
+        given: dict[str, Any] = {
+            field: {name: one for name, one in getattr(self, field).items() if name not in names}
+            for field in ("constraints", "terminal_constraints", "state_bounds", "path_constraints", "scales")}
+        return replace(self, **given)
+
+    @property
+    def unconstrained(self) -> OCP:
+        """The problem without its constraints; U stays."""
+        return self.without(*self.constraint_names)
+
+    def with_constraints(self, made: Callable[[ca.SX], ca.SX], **changed: Any) -> OCP:
+        """dataclasses.replace(self, **changed), the expressions of constraints as `made` has them."""
+        def each(given: Mapping[str, Any]) -> dict[str, Any]:
+            return {name: Within(one.low, made(one.expression), one.high) for name, one in given.items()}
+
+        paths = {name: made(h) for name, h in self.path_constraints.items()}
+        return replace(self, constraints=each(self.constraints), path_constraints=paths,
+                       terminal_constraints=each(self.terminal_constraints), **changed)
+
     def at(self, p: Any = None) -> OCP:
         """The problem with its parameters folded in as constants: p as [np] or by name, each of them."""
         return self.folded(self.parameters_of(p, 1, f"OCP on {self.system.name!r}, at")[0])
@@ -333,9 +467,9 @@ class OCP:
 
         with warnings.catch_warnings():  # of its kinks the problem itself has warned
             warnings.simplefilter("ignore")
-            return replace(self, system=self.system.at(value[:self.system.np]), running=folded(self.running),
-                           terminal=folded(self.terminal), x_goal=x_goal, u_goal=u_goal, p=None, parameters=None,
-                           path_constraints={name: folded(h) for name, h in self.path_constraints.items()})
+            return self.with_constraints(
+                folded, system=self.system.at(value[:self.system.np]), running=folded(self.running),
+                terminal=folded(self.terminal), x_goal=x_goal, u_goal=u_goal, p=None, parameters=None)
 
     @cached_property
     def goal(self) -> ca.Function:
@@ -416,14 +550,11 @@ class OCP:
 
     @cached_property
     def functions(self) -> Functions:
-        """f, L, L_soft, h, G, their derivatives, and symbols to build more of them on: the one door to them all."""
-        soft = self.running
-        for h in self.path_constraints.values():
-            soft = soft + self.penalty * ca.fmax(self.penalty_margin - h, 0) ** 2
-        h = ca.vertcat(ca.SX(0, 1), *self.path_constraints.values())
-        G = ca.substitute(self.terminal, known.time(), self.horizon) if \
-            ca.depends_on(self.terminal, known.time()) else self.terminal
-        return Functions(self.system, self.running, soft, h, G, p=self.p)
+        """f, L, L_soft, h, G, all constraints, derivatives, and symbols to build more of them on: the one door to them.
+        """
+        u, at_end = self.system.u, (replace(one, expression=self._at_end(one.expression)) for one in self.held_at_end)
+        return Functions(self.system, self.running, Rows.made(self.held, u), Rows.made(list(at_end), u),
+                         self._at_end(self.terminal), self._measured, self.penalty, self.penalty_margin, p=self.p)
 
     @property
     def L(self) -> ca.Function:
@@ -437,21 +568,36 @@ class OCP:
 
     @property
     def h(self) -> ca.Function:
-        """(x[, t][, p]) -> path constraints [number of them], each >= 0 where it holds."""
+        """(x[, t][, p]) -> inequalities of these alone [number of them], each >= 0 where it holds, in its own unit."""
         return self.functions.h
 
-    @cached_property
+    @property
+    def h_titles(self) -> tuple[str, ...]:
+        """Whose each row of h is, in words: "path constraint 'wall'"."""
+        rows = self.functions.rows
+        return tuple(rows.title(i) for i in range(rows.n_h))
+
+    @property
     def constraint_scales(self) -> Array:
-        """What violations of each path constraint are measured by [number of them]: see nocl/clearance.py."""
-        if not self.path_constraints:
-            return np.zeros(0)
-        at = self.moments(PLACES + 1)
-        at["p"][-1] = self.nominal
-        places = self.initial_states.sample(PLACES, sampling.own_numbers(0))
-        return scales(self.functions, np.vstack([places, self.x_goal]), self.moments, at)
+        """What violations of each row of h are measured by [number of them]: see nocl/constraints.py."""
+        return self.functions.scales[:self.functions.rows.n_h]
+
+    def _measured(self) -> tuple[Array, Array]:
+        """The scales of the rows along a trajectory, and at its end."""
+        of, rows, end, given = self.functions, self.functions.rows, self.functions.end_rows, self.scales
+        there = self.moments(PLACES + 1)
+        there["p"][-1] = self.nominal
+        x = np.vstack([self.initial_states.sample(PLACES, sampling.own_numbers(0)), self.x_goal])
+        place: Places = {"x": x, "u": self.goals(there["p"])[1], **there}
+        box, at_goal = self._samples(limits.SAMPLES), {"x": self.goals(there["p"])[0], "p": there["p"]}
+        n = rows.n_x
+        along = [*limits.sizes(rows[:n], of.node, box, place, self._box_of_x),
+                 *limits.sizes(rows[n:], of.arguments, box, place, self._box)]
+        at_end = limits.sizes(end, of.end, box, at_goal, self._box_of_x)
+        return limits.joined(rows, np.array(along), given), limits.joined(end, at_end, given)
 
     def least(self, x: Array, t: Any = None, p: Array | None = None) -> Array:
-        """The least value [B, number of them] of each path constraint along states x [B, n, nx]; inf for NaN.
+        """The least value [B, number of them] of each row of h along states x [B, n, nx]; inf for NaN.
 
         t [n] or [B, n] and p [B, np] where the problem has them.
         """
@@ -459,36 +605,84 @@ class OCP:
         x = checks.numeric(x, "x", "OCP.least", f"states [B, n, {n}]")
         if x.ndim != 3 or x.shape[2] != n or not x.shape[1]:
             raise ValueError(f"OCP.least: x has shape {x.shape}; expected [B, n, {n}]")
-        if not self.path_constraints:
+        if not self.functions.rows.n_h:
             return np.full((len(x), 0), np.inf)
-        B, nodes = x.shape[:2]
-        times = None if t is None else np.broadcast_to(t, (B, nodes)).ravel()
-        rows = None if p is None else np.repeat(p, nodes, axis=0)
-        h = self.h(*self.functions.node.columns(x=x.reshape(-1, n), t=times, p=rows)).full()
-        h = h.reshape(len(self.path_constraints), B, nodes)
-        return np.where(np.isfinite(h), h, np.inf).min(axis=2, initial=np.inf).T
+        return _least(self.h(*self.functions.node.columns(**_flat(x, t, p))).full(), *x.shape[:2])
 
-    def violation(self, least: Array) -> Array:
-        """The largest violation of a path constraint as a share of its scale [B], of least values [B, m]; 0: none."""
-        m = len(self.path_constraints)
+    def least_held(self, x: Array, u: Array, t: Array, p: Array) -> Array:
+        """The least value [B, m] of each row of `functions.rows` along x [B, n, nx] and u [B, n, nu] at times t; of
+        equations -|c|. The first ones are those of `least`; u [B, n - 1, nu] says nothing of the last state.
+        """
+        of = self.functions
+        found, rows = self.least(x, t, p), of.rows
+        if len(rows) == rows.n_h:
+            return found
+        if rows.n_x > rows.n_h:
+            c = of.c_of_x(*of.node.columns(**_flat(x, t, p))).full()[rows.n_h:]
+            found = np.hstack([found, _least(-np.abs(c), *x.shape[:2])])
+        return np.hstack([found, self._least_of_u(x[:, :u.shape[1]], u, t, p)])
+
+    def _least_of_u(self, x: Array, u: Array, t: Array, p: Array) -> Array:
+        """Those of the rows that hold the control; x and u [B, n, nu] are of the same times, the first ones of t."""
+        of, rows = self.functions, self.functions.rows[self.functions.rows.n_x:]
+        if not len(rows) or not x.shape[1]:
+            return np.full((len(x), len(rows)), np.inf)
+        given = _flat(x, np.asarray(t)[..., :x.shape[1]], p)
+        c = of.c_of_u(*of.arguments.columns(**given, u=u.reshape(-1, self.system.nu))).full()
+        return _least(rows.signed(c), *x.shape[:2])
+
+    def least_at_end(self, x: Array, p: Array) -> Array:
+        """The value [B, m] of each row of `functions.end_rows` at x [B, nx]; of equations -|c|; inf for NaN."""
+        rows, of = self.functions.end_rows, self.functions
+        c = rows.signed(of.c_at_end(*of.end.columns(x=x, p=p)).full()) if len(rows) else np.zeros((0, len(x)))
+        return _least(c, len(x), 1)
+
+    def clearance(self, x: Array, u: Array, t: Array, p: Array) -> Array:
+        """The least of all constraints [B] at the nodes of trajectories x [B, K+1, nx], u [B, K, nu], as `nearest`."""
+        return self.nearest(self.least_held(x, u, t, p), self.least_at_end(x[:, -1], p))
+
+    @property
+    def in_scales(self) -> bool:
+        """Whether clearances are in units of the constraints' scales: where there are any beside path constraints."""
+        return bool(self.held_at_end) or any(one.kind != PATH for one in self.held)
+
+    def nearest(self, least: Array, end: Array) -> Array:
+        """The least of least values [B, m] along and [B, m] at the end, in scales; where the problem has path
+        constraints alone, in their own units. inf where there are none.
+        """
+        if self.in_scales:
+            least, end = least / self.functions.scales, end / self.functions.end_scales
+        return np.asarray(np.hstack([least, end]).min(axis=1, initial=np.inf))
+
+    def violation(self, least: Array, end: Array | None = None) -> Array:
+        """The largest violation of a constraint as a share of its scale [B], of least values [B, m] along the
+        trajectory (`least_held`; where all are of states alone, `least`) and at its end (`least_at_end`); 0: none.
+        """
+        m = len(self.functions.rows)
         least = checks.numeric(least, "least", "OCP.violation", f"least values [B, {m}]")
         if least.ndim != 2 or least.shape[1] != m or np.isnan(least).any():
             raise ValueError(f"OCP.violation: least is {checks.shown(least)}; expected [B, {m}], as OCP.least gives it")
-        return np.asarray((-least / self.constraint_scales).max(axis=1, initial=0.0)) + 0.0
+        shares = -least / self.functions.scales
+        if end is not None:
+            shares = np.hstack([shares, -end / self.functions.end_scales])
+        return np.asarray(shares.max(axis=1, initial=0.0)) + 0.0
 
     @property
     def L_soft(self) -> ca.Function:
-        """(x, u[, t][, p]) -> running cost plus penalty * sum of max(margin - h, 0)^2: L itself without constraints."""
+        """(x, u[, t][, p]) -> running cost plus penalty * sum of max(margin - h, 0)^2: L itself without any h."""
         return self.functions.L_soft
 
     def __repr__(self) -> str:
         z = ca.vertcat(*self.functions.arguments.inputs)
-        values = ca.vertcat(self.functions.running, self.functions.terminal, *self.path_constraints.values())
+        held = (*self.held, *self.held_at_end)
+        values = ca.vertcat(self.functions.running, self.functions.terminal,
+                            *(self._at_end(one.expression) if one.kind == END else one.expression for one in held))
         (L, G, *constraints), shared = pretty.lines(values, z, prefix="c")
-        lines = [f"OCP on {self.system.name!r}: horizon {self.horizon:g}"]
+        horizon = f"free in [{self.horizon.low:g}, {self.horizon.high:g}]" if self.is_free else f"{self.horizon:g}"
+        lines = [f"OCP on {self.system.name!r}: horizon {horizon}"]
         lines += [pretty.wrapped("L", L), pretty.wrapped("G", G)]
-        lines += [pretty.filled(f"{name}: {h} >= 0")
-                  for name, h in zip(self.path_constraints, constraints, strict=True)]
+        lines += [pretty.filled(f"{one.name}{' at the end' * (one.kind == END)}: {one.text(e)}")
+                  for one, e in zip(held, constraints, strict=True)]
         lines += [pretty.wrapped(name, e, "    ") for name, e in shared.items()]
         lines += [pretty.filled(f"goal: x* = {_goal_text(self.x_goal)}, u* = {_goal_text(self.u_goal)}"),
                   pretty.filled(f"x0 ~ {self.initial_states!r}")]
@@ -499,11 +693,31 @@ class OCP:
 
     def to_data(self) -> dict[str, Any]:
         """The problem with its system as plain JSON data, exact to the last bit."""
-        return {"system": self.system.to_data(), "horizon": self.horizon, "x_goal": self.x_goal.tolist(),
+        horizon = {"free": [self.horizon.low, self.horizon.high]} if self.is_free else self.horizon
+        return {"system": self.system.to_data(), "horizon": horizon, "x_goal": self.x_goal.tolist(),
                 "u_goal": self.u_goal.tolist(), "initial_states": sampling.to_data(self.initial_states),
-                "L": instructions.to_data(self.L), "G": instructions.to_data(self.G), "h": instructions.to_data(self.h),
-                "path_constraints": list(self.path_constraints),
-                "penalty": self.penalty, "penalty_margin": self.penalty_margin, **self._parameter_data()}
+                "L": instructions.to_data(self.L), "G": instructions.to_data(self.G),
+                "h": instructions.to_data(self._paths), "path_constraints": list(self.path_constraints),
+                "penalty": self.penalty, "penalty_margin": self.penalty_margin, **self._parameter_data(),
+                **self._constraint_data()}
+
+    @property
+    def _paths(self) -> ca.Function:
+        """(x[, t][, p]) -> path constraints."""
+        return self.functions.node.function("h", {"h": ca.vertcat(ca.SX(0, 1), *self.path_constraints.values())})
+
+    def _constraint_data(self) -> dict[str, Any]:
+        """What to_data adds where there are constraints beside path constraints."""
+        of, found = self.functions, dict[str, Any]()
+        for kind, at, given in (("constraints", of.arguments, self.constraints),
+                                ("terminal_constraints", of.arguments.but("u"), self.terminal_constraints)):
+            if given:
+                column = ca.vertcat(*(one.expression for one in given.values()))
+                found[kind] = {"e": instructions.to_data(at.function("e", {"e": column})), "names": list(given),
+                               "bounds": [_bounds_data(one.low, one.high) for one in given.values()]}
+        if self.state_bounds:
+            found["state_bounds"] = {name: _bounds_data(*pair) for name, pair in self.state_bounds.items()}
+        return found | ({"scales": dict(self.scales)} if self.scales else {})
 
     def _parameter_data(self) -> dict[str, Any]:
         """What to_data adds where there are parameters."""
@@ -524,18 +738,47 @@ class OCP:
             constraints = ca.vertsplit(read(data["h"], at)) if data["path_constraints"] else []
             goal = instructions.from_data(data["goal"], [every])(every) if "goal" in data else \
                 (data["x_goal"], data["u_goal"])
-            return OCP(system, horizon=data["horizon"], x_goal=goal[0], u_goal=goal[1],
+            horizon = data["horizon"]
+            more = {kind: _constraints_from(data[kind], at) for kind in ("constraints", "terminal_constraints")
+                    if kind in data}
+            horizon = Free(*horizon["free"]) if isinstance(horizon, Mapping) else horizon
+            return OCP(system, horizon=horizon, x_goal=goal[0], u_goal=goal[1],
                        running=read(data["L"], at), terminal=read(data["G"], at), p=p,
                        parameters=sampling.from_data(data["parameters"]) if "parameters" in data else None,
                        initial_states=sampling.from_data(data["initial_states"]),
                        path_constraints=dict(zip(data["path_constraints"], constraints, strict=True)),
-                       penalty=data["penalty"], penalty_margin=data["penalty_margin"])
+                       penalty=data["penalty"], penalty_margin=data["penalty_margin"], **more,
+                       state_bounds=data.get("state_bounds", {}), scales=data.get("scales", {}))
         except MALFORMED as error:
             raise ValueError(f"not an OCP written by nocl: {type(error).__name__}: {error}; expected what to_data "
                              "gave") from error
 
     def __reduce__(self) -> tuple[Any, ...]:
         return OCP.from_data, (self.to_data(),)  # bare SX does not pickle
+
+
+def _bounds_data(low: float, high: float) -> list[float | None]:
+    return [bound if np.isfinite(bound) else None for bound in (low, high)]
+
+
+def _constraints_from(data: Mapping[str, Any], at: Mapping[str, ca.SX]) -> dict[str, Any]:
+    """The constraints that to_data wrote, by name."""
+    expressions = ca.vertsplit(read(data["e"], at))
+    return {name: (low, e, high) for name, e, (low, high) in zip(data["names"], expressions, data["bounds"],
+                                                                strict=True)}
+
+
+def _flat(x: Array, t: Any, p: Array | None) -> dict[str, Any]:
+    """States x [B, n, nx] at times t [n] or [B, n], with parameters p [B, np], a row each."""
+    B, nodes = x.shape[:2]
+    return {"x": x.reshape(-1, x.shape[2]), "t": None if t is None else np.broadcast_to(t, (B, nodes)).ravel(),
+            "p": None if p is None else np.repeat(p, nodes, axis=0)}
+
+
+def _least(c: Array, B: int, nodes: int) -> Array:
+    """Rows [m, B * nodes] as their least values [B, m]; inf for NaN."""
+    c = c.reshape(len(c), B, nodes)
+    return np.where(np.isfinite(c), c, np.inf).min(axis=2, initial=np.inf).T
 
 
 def beside(rows: Array, axes: int) -> Array:

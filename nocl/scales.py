@@ -33,7 +33,7 @@ def usual_sizes(ocp: OCP) -> Sizes:
     u = rng.uniform(s.lbu, s.ubu, (SAMPLES, s.nu))
     of, at = ocp.functions, ocp.moments(SAMPLES)
     L, G = (g(*a.columns(x=x, u=u, **at)).full() for g, a in ((of.L, of.arguments), (of.G, of.end)))
-    J = np.abs(ocp.horizon * L) + np.abs(G)
+    J = np.abs(ocp.longest * L) + np.abs(G)
     J = J[np.isfinite(J) & (J > 0)]
     return Sizes((s.ubx - s.lbx) / 2, (s.ubu - s.lbu) / 2, float(np.median(J)) if J.size else 1.0)
 

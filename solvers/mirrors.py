@@ -46,7 +46,7 @@ def mirrors(ocp: OCP, dynamics: Any = None) -> list[Mirror]:
         x, u = np.split(z * signs + goal, [n], axis=1)
         stage, node, end = (a.columns(x=x, u=u, **moments) for a in (of.arguments, of.node, of.end))
         f = f_of(*stage).full() * signs[:n, None]
-        return np.vstack([f, of.L(*stage).full(), of.G(*end).full(), np.sort(of.h(*node).full(), axis=0)])
+        return np.vstack([f, of.L(*stage).full(), of.G(*end).full(), *_held(ocp, stage, node, end)])
 
     same, found = everything(np.ones(n + s.nu)), []
     for flips in itertools.product((1.0, -1.0), repeat=int(group.max()) + 1):
@@ -56,6 +56,15 @@ def mirrors(ocp: OCP, dynamics: Any = None) -> list[Mirror]:
         if np.abs(everything(signs) - same).max() <= equal * np.abs(same).max():
             found.append((signs[:n], signs[n:]))
     return found
+
+
+def _held(ocp: OCP, stage: list[Array], node: list[Array], end: list[Array]) -> list[Array]:
+    """Values of all constraints, rising: which is which does not matter."""
+    of = ocp.functions
+    if ocp.states_only:
+        return [np.sort(of.h(*node).full(), axis=0)]
+    return [np.sort(rows.signed(c(*given).full()), axis=0)
+            for rows, c, given in ((of.rows, of.c, stage), (of.end_rows, of.c_end, end))]
 
 
 def _coupled(ocp: OCP, f: ca.Function, rounding: float) -> NDArray[np.int32]:

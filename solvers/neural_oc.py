@@ -243,6 +243,7 @@ def train_neural_oc(ocp: OCP, settings: NeuralOCSettings | None = None, *, dynam
     """
     checks.problem(ocp, "train_neural_oc")
     ocp.refuse_parameters("train_neural_oc")
+    ocp.refuse_constraints("train_neural_oc")
     if dynamics is not None:
         raise ValueError(f"train_neural_oc: dynamics is a {type(dynamics).__name__}; expected None: NeuralOC knows the "
                          "exact f, in closed form; for learned dynamics use nocl.train(ocp, dynamics=...)")

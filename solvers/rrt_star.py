@@ -64,6 +64,7 @@ class RRTStar:
                  tolerance: float = 1e-3, intervals: int = 400, seed: int = 0) -> None:
         checks.problem(ocp, "RRTStar")
         ocp.refuse_parameters("RRTStar")
+        ocp.refuse_constraints("RRTStar")
         owner = f"RRTStar on {ocp.system.name!r}"
         if (iterations is None) == (seconds is None):
             raise ValueError(f"{owner}: iterations is {iterations!r}, seconds {seconds!r}; expected one of them")
@@ -151,7 +152,7 @@ class RRTStar:
 
     def _valid(self, space: Any) -> Callable[[Any], bool]:
         h = self.ocp.h
-        if not self.ocp.path_constraints:
+        if not self.ocp.h_titles:
             return lambda state: bool(space.satisfiesBounds(state))
         buffer, run = cast(Any, h.buffer())  # CasADi without conversions: the check is called some 10,000 times a path
         x, values = np.zeros(3), np.zeros(h.numel_out(0))

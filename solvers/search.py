@@ -233,8 +233,9 @@ class Search:
 
     def solution(self) -> Solution:
         """The best of each state; seconds, iterations and `tried` are of all starts."""
-        clearance = self.ocp.least(self.best.x, self.t, self.p).min(axis=1, initial=np.inf)
-        return replace(self.best, clearance=clearance, seconds=self.seconds, iterations=self.iterations,
+        best = self.best
+        clearance = self.ocp.clearance(best.x, best.u, best.t, self.p)
+        return replace(best, clearance=clearance, seconds=self.seconds, iterations=self.iterations,
                        tried=self._tried(), unit=np.full(len(self.x0), self.unit))
 
 

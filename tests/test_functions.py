@@ -205,7 +205,7 @@ class Reader(ast.NodeVisitor):
 
     def visit_Call(self, node: ast.Call) -> None:
         called = ast.unparse(node.func)
-        if called.endswith(("path_constraints.values", "path_constraints.items")):
+        if called.endswith(("constraints.values", "constraints.items")):
             self.found.append(f"line {node.lineno}: {ast.unparse(node)}")
         if called.endswith("ca.Function") and len(node.args) > 1:
             names = set(words(node.args[1])) | {w for arg in node.args[3:4] for w in words(arg)}

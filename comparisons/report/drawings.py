@@ -131,8 +131,8 @@ def _car(x: Array) -> Array:
 
 
 def _forbidden(ax: Any, ocp: OCP, low: Array, high: Array) -> None:
-    """Where a path constraint on the first two coordinates is violated, the others at the goal."""
-    if not ocp.path_constraints:
+    """Where a constraint on the first two coordinates is violated, the others at the goal."""
+    if not ocp.h_titles:
         return
     a, b = (np.linspace(low[c], high[c], 160) for c in (0, 1))
     x = np.tile(ocp.x_goal, (a.size * b.size, 1))

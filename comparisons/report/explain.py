@@ -92,7 +92,7 @@ def _manners(report: Results, m: int, b: int | None, i: int) -> Iterator[str]:
     """Collision and saturation."""
     s = report.judged[m].simulation
     if not report.feasible[m, i]:
-        yield f"It violates a path constraint by {number(-float(s.clearance[i]))}."
+        yield f"It {report.violated(m, i)}."
     if s.saturation[i] > 0.05:
         beside = f", the best run's {100 * report.judged[b].simulation.saturation[i]:.0f} %" if b not in (None, m) \
             else ""

@@ -29,7 +29,7 @@ from nocl.scales import usual_sizes
 from nocl.support.checks import Array
 
 REFERENCE = "reference"  # the name of a yardstick among the methods: its speed is no method's
-VIOLATION = 1e-3  # a path constraint below minus this share of its own scale is violated
+VIOLATION = 1e-3  # a constraint below minus this share of its own scale is violated
 WIDTH = 118  # characters of a line in the terminal
 Mask = NDArray[np.bool_]
 
@@ -60,7 +60,7 @@ class Judged:
 
     @property
     def feasible(self) -> Mask:
-        """[B], whether the run reached the horizon with all path constraints held."""
+        """[B], whether the run reached the horizon with all constraints held."""
         return np.asarray(self.simulation.success, dtype=bool) & ~(self.simulation.violation > VIOLATION)
 
 
@@ -149,6 +149,13 @@ class Results:
         """[methods, B], cost - best in per cent of |best|; inf where a run failed or nobody has a best."""
         gap = per_cent(self.cost - self.best, self.best, usual_sizes(self.ocp).cost)
         return np.where(np.isnan(gap), np.inf, gap)
+
+    def violated(self, m: int, i: int) -> str:
+        """By how much a run violates a constraint, in words."""
+        s = self.judged[m].simulation
+        if self.ocp.in_scales:
+            return f"violates a constraint by {number(100 * float(s.violation[i]))} % of its scale"
+        return f"violates a path constraint by {number(-float(s.clearance[i]))}"
 
     def within(self, percent: float) -> Mask:
         """[methods, B], whether a run violates nothing and is within so much of the best known cost."""

@@ -122,7 +122,7 @@ def run_cell(report: Results, m: int, i: int) -> str:
     if not s.success[i]:
         return f"failed: {s.message[i]}"
     if not report.feasible[m, i]:
-        return f"{number(report.cost[m, i])}, violates a path constraint by {number(-s.clearance[i])}"
+        return f"{number(report.cost[m, i])}, {report.violated(m, i)}"
     return f"{number(report.cost[m, i])} ({percent(report.gap[m, i])} %)"
 
 

@@ -27,7 +27,8 @@ def verdict(report: Results) -> list[str]:
     summary = report.summary()
     n = len(report.x0)
     open_loop = [said for j in report.judged for said in _without_feedback(j)]
-    return [_near(report, summary), *_manners(summary), *open_loop, *_speed(summary), *_failures(summary, n)]
+    what = "constraint" if report.ocp.in_scales else "path constraint"
+    return [_near(report, summary), *_manners(summary), *open_loop, *_speed(summary), *_failures(summary, n, what)]
 
 
 def _near(report: Results, summary: Sequence[Row]) -> str:
@@ -86,9 +87,9 @@ def _speed(summary: Sequence[Row]) -> list[str]:
             f"{number(slow['ms_per_solve'])} ms: {times} times faster."]
 
 
-def _failures(summary: Sequence[Row], n: int) -> list[str]:
+def _failures(summary: Sequence[Row], n: int, what: str) -> list[str]:
     parts = [f"{row['method']} failed on {row['failures']} of {n}" for row in summary if row["failures"]]
-    parts += [f"{row['method']} violates a path constraint on {row['violations']} of {n}" for row in summary
+    parts += [f"{row['method']} violates a {what} on {row['violations']} of {n}" for row in summary
               if row["violations"]]
-    return ["; ".join(parts) + "."] if parts else ["No run failed, and no path constraint was violated."
+    return ["; ".join(parts) + "."] if parts else [f"No run failed, and no {what} was violated."
                                                    if math.isfinite(summary[0]["clearance_min"]) else "No run failed."]

@@ -178,7 +178,7 @@ def _list(args: argparse.Namespace) -> None:
     for name in NAMES:
         ocp = load_ocp(name)
         s = ocp.system
-        print(f"{name.ljust(width)}  {s.nx:6d}  {s.nu:8d}  {ocp.horizon:7g}  {_about(name)}")
+        print(f"{name.ljust(width)}  {s.nx:6d}  {s.nu:8d}  {ocp.longest:7g}  {_about(name)}")
 
 
 def _about(name: str) -> str:
@@ -209,6 +209,7 @@ def _run(args: argparse.Namespace) -> None:
     from nocl.cli.run_folder import RunFolder  # torch
 
     ocp, out = _problem(args)
+    ocp.refuse_constraints("nocl run")
     if not args.exact:
         _check_learnable(ocp)
     stages = RunFolder(ocp, out, args.seed, args.effort)
@@ -252,6 +253,7 @@ def _train(args: argparse.Namespace) -> None:
     from nocl.cli.run_folder import RunFolder  # torch
 
     ocp, out = _problem(args)
+    ocp.refuse_constraints("nocl train")
     if not args.exact:
         _check_learnable(ocp)
     stages = RunFolder(ocp, out, args.seed, args.effort)

@@ -268,7 +268,7 @@ def solve(ocp: OCP, out: Path, name: str, n: int, options: registry.Options, wor
     method = built(ocp, registry.METHODS[name], options)
     planned = is_plan(method)
     s, arrays, facts = _solved(ocp, method, starts, workers, checkpoint) if planned else _simulated(ocp, method, starts)
-    judged = _judged(ocp, starts, arrays) if planned else {}
+    judged = _judged(ocp, starts, arrays) if planned and not ocp.is_free else {}  # no judge has a free horizon yet
     if ocp.np:
         arrays["p"], facts["parameters"] = starts.p, list(ocp.parameter_names)
     if at:
@@ -302,7 +302,7 @@ def _verdict(ocp: OCP, arrays: dict[str, Any], judged: dict[str, Any], message: 
     rows = np.flatnonzero(~np.isnan(judged.get("judged_cost", np.zeros(0))))
     if len(rows):
         cost, clear = judged["judged_cost"][rows], judged["judged_clearance"][rows]
-        clearance = f"; least clearance {clear.min():.3g}" if ocp.path_constraints else ""
+        clearance = f"; least clearance {clear.min():.3g}" if ocp.constraint_names else ""
         said.append(f"judged in open loop on the exact f, {count(len(rows), 'plan')}: mean cost {cost.mean():.4g}, "
                     f"predicted {arrays['cost'][rows].mean():.4g}{clearance}")
         most = COARSE * np.abs(arrays["cost"][rows]) + TINY * usual_sizes(ocp).cost

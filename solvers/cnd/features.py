@@ -132,7 +132,7 @@ def _of_parameters(ocp: OCP, at: Arguments, off: ca.SX, labels: Places, tau: ca.
     if plain:
         away, half = ocp.from_goal(labels.x, labels.p)[:, plain], usual_sizes(ocp).x[plain]
         parts.append((_standard(off[plain], away, tau, moment, half), 1.0))
-    if ocp.path_constraints:
+    if ocp.h_titles:
         parts.append((at.but("dt").call(ocp.functions.h), ocp.constraint_scales))
     return parts
 

@@ -30,11 +30,10 @@ class Lifted:
         self.of, s = ocp, ocp.system
         self.clock = [ca.SX.sym("clock")] if ocp.uses_time else []
         self.p = ca.vertcat(s.p, ocp.p)
-        self.ocp = replace(
-            ocp, system=self._system(), running=self._at(ocp.running), terminal=self._at(ocp.terminal),
+        self.ocp = ocp.with_constraints(
+            self._at, system=self._system(), running=self._at(ocp.running), terminal=self._at(ocp.terminal),
             x_goal=[*ocp.x_goal, *[ocp.horizon] * len(self.clock), *ocp.nominal], u_goal=np.array(ocp.u_goal),
-            initial_states=self._box(), p=None, parameters=None,
-            path_constraints={name: self._at(h) for name, h in ocp.path_constraints.items()})
+            initial_states=self._box(), p=None, parameters=None)
 
     def _at(self, expression: ca.SX) -> ca.SX:
         return ca.substitute(expression, time(), self.clock[0]) if self.clock else expression

@@ -113,6 +113,7 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
 
 def _check(ocp: OCP, dynamics: LearnedDynamics | None, seed: int, out: str | os.PathLike[str] | None) -> None:
     checks.instance(OCP, ocp, "ocp", "train", "nocl.load_ocp(name)")
+    ocp.refuse_constraints("train")
     checks.whole(seed, "seed", "train", most=2**62 - 1)
     if out is not None and Path(out).exists() and not Path(out).is_dir():
         raise ValueError(f"train: out is the file {out}; expected a folder for checkpoints")

@@ -41,9 +41,9 @@ def kicked_optima(ddp: DDP, fine: DDP, bank: SolutionBank, policy: Policy, torch
 
 
 def feasible(ocp: OCP, s: Solution) -> Solution:
-    """The solutions that hold the path constraints at all nodes: where a collision can no longer be avoided, V is that
+    """The solutions that hold all constraints at all nodes: where a collision can no longer be avoided, V is that
     of the penalty."""
-    if not ocp.path_constraints:
+    if not ocp.h_titles:
         return s
     return s[(ocp.least(s.x, s.t, s.parameters) >= 0).all(axis=1)]
 

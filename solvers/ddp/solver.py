@@ -95,6 +95,7 @@ class DDP:
                  constraints: str = "hard", threads: int | None = None,
                  cache: str | os.PathLike[str] | None = None) -> None:
         checks.problem(ocp, "DDP")
+        ocp.refuse_constraints("DDP")
         for name, value in (("intervals", intervals), ("substeps", 1 if substeps is None else substeps),
                             ("threads", 1 if threads is None else threads)):
             checks.whole(value, name, "DDP", 1)
@@ -391,14 +392,14 @@ class Work:
     def _violations(self, t: Array) -> Iterator[tuple[int, str]]:
         """Rows that converged, but across a path constraint, and in words which, where and when."""
         ocp = self.ddp.ocp
-        if self.ddp.constraints == "soft" or not ocp.path_constraints:
+        if self.ddp.constraints == "soft" or not ocp.h_titles:
             return
         over = ocp.violation(ocp.least(self.x, t, self.p)) > TOLERATED
         for i in np.flatnonzero((self.state == CONVERGED) & over):
             h = ocp.h(*ocp.functions.node.columns(x=self.x[i], t=t[i], p=self.p[i])).full()
             k, node = np.unravel_index(np.argmin(h / ocp.constraint_scales[:, None]), h.shape)
             why = "by the initial state itself: move it" if node == 0 else CROSSED
-            yield int(i), (f"path constraint {list(ocp.path_constraints)[k]!r} is violated by {-h[k, node]:.3g} at "
+            yield int(i), (f"{ocp.h_titles[k]} is violated by {-h[k, node]:.3g} at "
                            f"node {node}, t = {t[i, node]:.4g}, {why}")
 
 

@@ -197,11 +197,11 @@ def eased(ocp: OCP, slope: float) -> OCP:
     if ocp.penalty == 0:
         return ocp
     added = ca.SX(0)
-    for h in ca.vertsplit(ocp.functions.constraints):
+    for h in ocp.functions.penalised:
         depth = ca.fmax(ocp.penalty_margin - h, 0)
         bent = ca.fmin(depth, slope / (2 * ocp.penalty))
         added += ocp.penalty * bent**2 + slope * (depth - bent)
-    return replace(ocp, running=ocp.functions.running + added, path_constraints={})
+    return replace(ocp.unconstrained, running=ocp.functions.running + added)
 
 
 def _extremes(ocp: OCP, samples: int) -> tuple[Array, float]:

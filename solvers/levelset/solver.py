@@ -99,6 +99,7 @@ class LevelSet:
                  max_seconds: float = 600.0) -> None:
         checks.problem(ocp, "LevelSet")
         ocp.refuse_parameters("LevelSet")
+        ocp.refuse_constraints("LevelSet")
         owner = f"LevelSet of {ocp.system.name!r}"
         self.ocp, self.grid = ocp, _checked_grid(grid, ocp.system.nx, owner)
         if scheme not in SCHEMES:
@@ -307,6 +308,7 @@ def standard(ocp: OCP) -> LevelSet:
     """Level sets on the problem's box, as the command line makes them; ValueError for more than 3 states."""
     checks.problem(ocp, "level sets")
     ocp.refuse_parameters("level sets")
+    ocp.refuse_constraints("level sets")
     nx = ocp.system.nx
     if nx not in STANDARD:
         raise ValueError(f"level sets of {ocp.system.name!r}: the problem has {nx} states; expected at most "

@@ -1,4 +1,5 @@
-"""Where multiple shooting starts from: each guess is states x [N+1, nx] and controls u [N, nu]."""
+"""Where multiple shooting starts from: each guess is states x [N+1, nx], controls u [N, nu], and, where the horizon is
+free, the nodes t [N+1]."""
 
 from __future__ import annotations
 
@@ -14,7 +15,7 @@ from nocl.solvers.starts import HALVINGS, near, random_controls
 from nocl.support import checks
 from nocl.support.checks import Array
 
-Guess = tuple[Array, Array]
+Guess = tuple[Array, ...]  # (x, u), or (x, u, t)
 BULGES = 0.1 * 1.4 ** np.arange(12)  # of a line round an obstacle, in lengths of the line
 
 
@@ -28,7 +29,7 @@ def starts(program: Transcription, lqr: LQR | None, x0: Array, t: Array, begin: 
     """
     ocp, N, row = program.ocp, program.N, np.zeros((1, 0)) if p is None else p[None]
     u_goal = np.tile(ocp.goals(row)[1], (N, 1))
-    found = [(np.tile(x0, (N + 1, 1)), u_goal)]
+    found: list[Guess] = [(np.tile(x0, (N + 1, 1)), u_goal)]
     if begin + n > 1 and lqr is not None:
         found += lqr_rollout(program, lqr, x0, t, p)
     found.append((x0 + np.linspace(0.0, 1.0, N + 1)[:, None] * -ocp.from_goal(x0, row[0]), u_goal))
@@ -38,10 +39,26 @@ def starts(program: Transcription, lqr: LQR | None, x0: Array, t: Array, begin: 
     return found[begin:begin + n] + [controlled(program, x0, u, t, p) for u in random]
 
 
+def with_horizons(program: Transcription, x0: Array, t: Array, begin: int, n: int, seed: int,
+                  p: Array | None = None) -> list[Guess]:
+    """Those `starts` where the horizon is free, each with another one: evenly spread, of a logarithmic scale."""
+    horizon, found = program.ocp.horizon, list[Guess]()
+    for number in range(begin, begin + n):
+        nodes = t / t[-1] * horizon.low ** (1 - _spread(number)) * horizon.high ** _spread(number)
+        found += [(*guess, nodes) for guess in starts(program, None, x0, nodes, number, 1, seed, p)]
+    return found
+
+
+def _spread(number: int) -> float:
+    """1/2, 1/4, 3/4, 1/8, 5/8, ...: the numbers from 1 on, their binary digits behind the point in reverse."""
+    digits = bin(number + 1)[2:]
+    return sum(2.0 ** -(i + 1) for i, digit in enumerate(reversed(digits)) if digit == "1")
+
+
 def lqr_of(ocp: OCP) -> LQR | None:
     """LQR about the goal, or None where the problem has none."""
     try:
-        lqr = LQR(ocp)
+        lqr = LQR(ocp if ocp.states_only else ocp.unconstrained)
         lqr.P(0.0)
     except ValueError:
         return None
@@ -109,7 +126,7 @@ def sides(ocp: OCP, x0: Array, N: int, t: Array | None = None, p: Array | None =
     s, found, node = np.linspace(0.0, 1.0, N + 1)[:, None], list[Array](), ocp.functions.node
     off = ocp.from_goal(x0, p)
     line, times = x0 - s * off, np.zeros(N + 1) if t is None else t
-    for i in range(len(ocp.path_constraints)):
+    for i in range(len(ocp.h_titles)):
         values = ocp.h(*node.columns(x=line, t=times, p=p)).full()[i]
         k = int(np.argmin(values))
         if values[k] >= 0:

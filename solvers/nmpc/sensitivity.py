@@ -72,7 +72,11 @@ def derivatives(program: Transcription) -> Derivatives:
 def cost_to_go(program: Transcription, t: Array, x: Array, u: Array, p: Array | None = None) -> Array:
     """V [N+1] at the nodes t of x [N+1, nx], u [N, nu]; p [np], here and below, where there are parameters."""
     stages = program.step(x[:-1].T, u.T, *program.moment(t[:-1], p), np.diff(t)[None])[1].full().ravel()
-    return np.cumsum(np.r_[float(program.end_cost(x[-1], t[-1], p)), stages[::-1]])[::-1]
+    V = np.cumsum(np.r_[float(program.end_cost(x[-1], t[-1], p)), stages[::-1]])[::-1]
+    if not program.held.slacks:
+        return V
+    slacks = program.needed(t, x, u, np.zeros(0) if p is None else p).sum(axis=1)
+    return np.asarray(V + program.held.weight * np.cumsum(slacks[::-1])[::-1])
 
 
 def dense(program: Transcription, t: Array, x: Array, u: Array, costate: Array, p: Array | None = None) -> Array:

@@ -58,7 +58,11 @@ class NMPC:
     passes : rounds in which states of one batch are solved again from other states' solutions, until a round improves
         nothing; nocl.solvers.search says what a round tries
     neighbours : how many of them are the nearest states', one more in each round
-    constraints : "hard": path constraints at the nodes; "soft": the penalty of ocp.L_soft in the cost instead
+    constraints : "hard": all constraints at the nodes, those that hold the control at the start of each interval, under
+        its control, and those of the end at the last node; "soft": the penalty of ocp.L_soft in the cost instead, where
+        all are inequalities of (x, t, p)
+    soft : names of constraints that an exact penalty holds: they are held where they can be, and exceeded where not, by
+        as little as may be; `cost` has the penalty in it, and the Solution's `slack` says by how much
     seed : of the random starts
     time_limit : seconds after which a single solve, from one start, is given up and the others go on; default: generous
         beside what the other solves took (at least 10 s)
@@ -82,6 +86,7 @@ class NMPC:
     passes: int = field(default=4, kw_only=True)
     neighbours: int = field(default=3, kw_only=True)
     constraints: str = field(default="hard", kw_only=True)
+    soft: Sequence[str] = field(default=(), kw_only=True)
     seed: int = field(default=0, kw_only=True)
     time_limit: float | None = field(default=None, kw_only=True)
     options: Mapping[str, Any] | None = field(default=None, kw_only=True)
@@ -94,6 +99,7 @@ class NMPC:
                 checks.whole(getattr(self, name), name, "NMPC", least)
         checks.whole(self.seed, "seed", "NMPC", most=2**63)
         checks.word(self.constraints, ("hard", "soft"), "constraints", "NMPC")
+        self._check_soft()
         if not isinstance(self.solver, str) or (self.solver not in BACKENDS and not _known(self.solver)):
             raise ValueError(f"NMPC: solver is {self.solver!r}; expected {' or '.join(BACKENDS)}, or an nlpsol "
                              "that this CasADi has")
@@ -103,13 +109,33 @@ class NMPC:
                                              and all(isinstance(key, str) for key in self.options)):
             raise ValueError(f"NMPC: options is {checks.shown(self.options)}; expected a dict of options of the "
                              'nlpsol by name, like {"ipopt.tol": 1e-6}')
-        if checks.number(self.window, "horizon", "NMPC", positive=True) > self.ocp.horizon:
-            raise ValueError(f"NMPC: horizon is {self.horizon!r}; expected at most {self.ocp.horizon:g}, the OCP's")
+        self._check_window()
         if self.time_limit is not None:
             checks.number(self.time_limit, "time_limit", "NMPC", positive=True)
         if self.dynamics is not None:
             object.__setattr__(self, "dynamics", dynamics_function(self.ocp, self.dynamics))
         object.__setattr__(self, "terminal", _terminal(self.ocp, self.terminal))
+
+    def _check_window(self) -> None:
+        if self.horizon is not None and self.ocp.is_free:
+            raise ValueError(f"NMPC: horizon is {self.horizon!r}, but that of the problem is {self.ocp.horizon!r}; "
+                             "expected one of them: leave it out")
+        if checks.number(self.window, "horizon", "NMPC", positive=True) > self.ocp.longest:
+            raise ValueError(f"NMPC: horizon is {self.horizon!r}; expected at most {self.ocp.longest:g}, the OCP's")
+
+    def _check_soft(self) -> None:
+        """ValueError for names of no constraints, and for the penalty where it says nothing of some."""
+        soft = tuple(checks.words(self.soft, "soft", "NMPC"))
+        unknown = [name for name in soft if name not in self.ocp.constraint_names]
+        if unknown or len(set(soft)) < len(soft):
+            raise ValueError(f"NMPC: soft is {list(soft)}; expected names of constraints, each once "
+                             f"({', '.join(self.ocp.constraint_names) or 'the problem has none'})")
+        object.__setattr__(self, "soft", soft)
+        if self.constraints == "soft" and soft:
+            raise ValueError(f"NMPC: constraints is 'soft' and soft is {list(soft)}; expected one of them: 'soft' is "
+                             "the penalty of ocp.L_soft for all")
+        if self.constraints == "soft":
+            self.ocp.refuse_constraints("NMPC with constraints='soft'", "name what is soft, NMPC(soft=[...])")
 
     def __getstate__(self) -> dict[str, Any]:
         return {f.name: getattr(self, f.name) for f in fields(self)}  # without what is cached: it is built again
@@ -117,14 +143,15 @@ class NMPC:
     @property
     def window(self) -> float:
         """The length of the window that is optimised."""
-        return self.ocp.horizon if self.horizon is None else self.horizon
+        return self.ocp.longest if self.horizon is None else self.horizon
 
     @cached_property
     def key(self) -> str:
         """A fingerprint of the program: of the problem, models and settings that it is built from."""
         options = sorted((self.options or {}).items())
         return fingerprint(self.ocp.to_data(), self.dynamics, self.terminal,
-                           int(self.intervals), int(self.substeps or 0), self.constraints, self.solver, options)
+                           int(self.intervals), int(self.substeps or 0), self.constraints, self.solver, options,
+                           *([list(self.soft)] if self.soft else []))
 
     @property
     def program(self) -> Transcription:
@@ -173,7 +200,8 @@ class NMPC:
             [B, N, nu], (x [B, N+1, nx], u), a controller (x, t[, p]) -> u whose rollout is meant, or a list of them
         nodes : times of the nodes [N+1]; default: N equal intervals from t0 to the window's end
         starts : built-in starts for each state; default: self.starts, or none where guesses are given
-        gains : also the Solution's `gain` and `V_xx`
+        gains : also the Solution's `gain` and `V_xx`; where all constraints are inequalities of (x, t, p), none of them
+            soft, and the horizon is a number
         workers : 1, a number of processes, "auto": processes where the measured cost of the first states says that
             they pay; or "tcp://...", a Dask scheduler
         out : a folder that gets each state's outcome as soon as it is there: the same call resumes what is there
@@ -182,19 +210,21 @@ class NMPC:
         Returns a Solution with a row for each state, the same for any `workers`. Its `seconds`, `iterations`, `starts`
         and `optima` cover all that was tried. A state without a solution has success False, cost inf, and the message
         of its most feasible start. A state outside X is solved, and its message notes it: X is where samples are drawn
-        from, which binds no exact f, but a learned model was not fitted there.
+        from, which binds no exact f, but a learned model was not fitted there. Where the horizon is free, each row has
+        nodes t of its own. Where constraints cannot be held, the message names the one that the nearest plan exceeds
+        most, by how much and at which node.
         Raises ValueError before any solve where shapes do not fit or numbers are not finite.
         """
         s = self.ocp.system
         rows, _ = checks.states(x0, s.nx, s.name)
         if not len(rows):
             raise ValueError(f"x0 has shape {np.shape(x0)}; expected at least one state")
+        self._check_gains(gains)
         t, values = self._nodes(t0, nodes), self.ocp.parameters_of(p, len(rows), "NMPC")
         tried = [one for one in (guesses if isinstance(guesses, list) else [guesses]) if one is not None]
         tried.sort(key=lambda one: not _is_solution(one))
         given, warm = [_given(one, self, rows, t, values) for one in tried], sum(map(_is_solution, tried))
         n = checks.whole(starts, "starts", "NMPC.solve") if starts is not None else (0 if given else self.starts)
-        gains = checks.flag(gains, "gains", "NMPC.solve")
         if n < 1 and not given:
             raise ValueError(f"starts is {n}; expected at least 1, or guesses")
         show = sys.stderr.isatty() if progress is None else progress
@@ -254,12 +284,21 @@ class NMPC:
         search.improve(call.starts)
         return states.finished(search.solution())
 
+    def _check_gains(self, gains: bool) -> None:
+        """ValueError where gains are asked for, and there are none yet."""
+        if checks.flag(gains, "gains", "NMPC.solve"):
+            self.ocp.refuse_constraints("NMPC with gains", "solve it without gains")
+        if gains and self.soft:
+            raise ValueError(f"NMPC: gains are not implemented for soft constraints, and soft is {list(self.soft)}; "
+                             "expected soft=[], or gains=False")
+
     def with_gains(self, solution: Solution) -> Solution:
         """A Solution of this NMPC with its feedback `gain` and `V_xx`.
 
         By a Riccati recursion with the exact second derivatives of the discretised problem; controls at a bound keep
         it (zero gain) and active path constraints stay active.
         """
+        self._check_gains(True)
         B, (N, nx, nu) = len(solution.x), (self.intervals, self.ocp.system.nx, self.ocp.system.nu)
         if solution.u.shape != (B, N, nu):
             raise ValueError(f"the solution's u has shape {solution.u.shape}; expected [B, {N}, {nu}], of this NMPC")
@@ -274,9 +313,12 @@ class NMPC:
 
         hold: how many controls T has (default N); receding: a window that moves on, instead of one that ends at T.
         """
+        self.ocp.refuse_free("NMPC.controller")
         return Loop(self, hold, receding)
 
     def _nodes(self, t0: float, nodes: ArrayLike | None) -> Array:
+        if self.ocp.is_free:
+            return self._free_nodes(t0, nodes)
         T, N = self.ocp.horizon, self.intervals
         t0 = checks.start_time(t0, T)
         t = np.linspace(t0, min(t0 + self.window, T), N + 1) if nodes is None else \
@@ -286,6 +328,14 @@ class NMPC:
         if self.horizon is None and t[-1] < T * (1 - 1e-9):
             raise ValueError(f"nodes end at {t[-1]:g}; expected {T:g}, the horizon: give NMPC a shorter `horizon`")
         return t
+
+    def _free_nodes(self, t0: float, nodes: ArrayLike | None) -> Array:
+        """Equal intervals, as long as a middling horizon makes them."""
+        if t0 != 0 or nodes is not None:
+            raise ValueError(f"NMPC: t0 is {t0!r}, nodes are {checks.shown(nodes)}, but the horizon is free; expected "
+                             "t0 = 0 and no nodes: the solver finds where they are")
+        horizon = self.ocp.horizon
+        return np.linspace(0.0, np.sqrt(horizon.low * horizon.high), self.intervals + 1)
 
     def _run_key(self, x0: Array, t: Array, p: Array, given: list[list[Guess]], *counts: int) -> str:
         """A fingerprint of all that outcomes depend on."""
@@ -320,7 +370,7 @@ def shared_program(recipe: _Recipe) -> Transcription:
     m = recipe.nmpc
     return Transcription(m.ocp, dynamics_function(m.ocp, m.dynamics), int(m.intervals), int(m.substeps or 1),
                          m.constraints == "soft", m.solver, tuple(sorted((m.options or {}).items())), m.terminal,
-                         None if m._folder is None else (m.key, m._folder))
+                         None if m._folder is None else (m.key, m._folder), tuple(m.soft))
 
 
 @lru_cache(maxsize=KEPT)
@@ -384,7 +434,9 @@ class _Job:
 
     def __call__(self, task: Task) -> Outcome:
         program, guesses = self.nmpc.program, list(task.guesses)
-        if task.starts:
+        if task.starts and program.free:
+            guesses += starting.with_horizons(program, task.x0, task.t, task.begin, task.starts, task.seed, task.p)
+        elif task.starts:
             p = () if task.p is None else tuple(task.p.tolist())
             guesses += starting.starts(program, _lqr(self.nmpc.ocp, p), task.x0, task.t, task.begin, task.starts,
                                        task.seed, task.p)
@@ -399,6 +451,7 @@ class _States:
         self.x0, self.t, self.p = call.x0, call.t, call.p
         self.refusal = [violated_start(nmpc.program, x, self.t[0], p) for x, p in zip(self.x0, self.p, strict=True)]
         self.failed: list[Answer | None] = [None] * len(self.x0)  # of each state's solves that failed, by rank
+        self.cost, self.horizon = np.full(len(self.x0), np.inf), np.full(len(self.x0), self.t[-1])  # of the best so far
 
     def begin(self, stage: int, what: str) -> None:
         self.number, self.what = stage - 1, what
@@ -418,8 +471,12 @@ class _States:
     def follow(self, moves: Moves, guess: Callable[[Moves], dict[str, Array]]) -> Found:
         tasks = []
         for i in np.unique(moves.row):
-            made = guess(moves[moves.row == i])
+            mine = moves[moves.row == i]
+            made = guess(mine)
             guesses = [starting.from_neighbour(self.x0[i], x, u) for x, u in zip(made["x"], made["u"], strict=True)]
+            if self.nmpc.ocp.is_free:
+                shares = self.horizon[mine.parent] / self.t[-1] * (1 - mine.begin / self.t[-1])
+                guesses = [(*one, share * self.t) for one, share in zip(guesses, shares, strict=True)]
             tasks.append(Task(f"round-{self.number}-{i:06d}", int(i), self.x0[i], self.t, guesses,
                               time_limit=self.nmpc.time_limit, p=self._own(i)))
         return self._do(tasks)
@@ -429,6 +486,8 @@ class _States:
         outcomes = do(_Job(self.nmpc), tasks, self.call.pool, self.journal, self.call.show, self.what)
         for outcome in outcomes:
             best, failed = self.failed[outcome.row], outcome.failed
+            if outcome.best is not None and outcome.best.t is not None and outcome.best.cost < self.cost[outcome.row]:
+                self.cost[outcome.row], self.horizon[outcome.row] = outcome.best.cost, outcome.best.t[-1]
             if failed is not None and (best is None or failed.rank < best.rank):
                 self.failed[outcome.row] = failed
         yield np.array([o.row for o in outcomes], dtype=np.int64), \
@@ -438,14 +497,16 @@ class _States:
         """What the search found, with V, what solution(t) interpolates, and messages."""
         p, between = self.nmpc.program, np.full((*found.u.shape[:2], 4, 2 * found.x.shape[2]), np.nan)
         message = [why or found.message[i] + outside(p, self.x0[i]) for i, why in enumerate(self.refusal)]
+        slack = np.full((*found.x.shape[:2], len(self.nmpc.soft)), np.nan)
         for i in range(len(self.x0)):
-            row = (self.t, found.x[i], found.u[i])
+            row = (found.t[i], found.x[i], found.u[i])
             if found.success[i]:
                 own = self._own(i)
                 found.V[i], between[i] = cost_to_go(p, *row, own), dense(p, *row, found.V_x[i], own)
+                slack[i] = p.slack(*row, own)
             elif not self.refusal[i]:
                 message[i] = failure(p, self.x0[i], int(found.starts[i]), self.failed[i], self._own(i))
-        return replace(found, message=np.array(message), dense=between)
+        return replace(found, message=np.array(message), dense=between, slack=slack if self.nmpc.soft else None)
 
 
 def _is_solution(guess: Any) -> bool:
@@ -458,6 +519,8 @@ def _given(guess: Any, nmpc: NMPC, x0: Array, t: Array, p: Array) -> list[Guess]
     check_made_for(nmpc.ocp, guess, "NMPC: the guess")
     if isinstance(guess, tuple) and len(guess) != 2:
         raise ValueError(f"NMPC: the guess is a tuple of {len(guess)}; expected (x [B, N+1, nx], u [B, N, nu])")
+    if nmpc.ocp.is_free:
+        return _of_free(guess, nmpc, x0, t, p)
     if callable(guess) and not isinstance(guess, Solution):
         return [starting.controller_rollout(nmpc.program, guess, row, t, own)
                 for row, own in zip(x0, p, strict=True)]
@@ -467,6 +530,18 @@ def _given(guess: Any, nmpc: NMPC, x0: Array, t: Array, p: Array) -> list[Guess]
     if x is not None:
         return list(zip(_shaped(x, (B, N + 1, s.nx), "the guess's x", "[B, N+1, nx]"), u, strict=True))
     return [_rollout(nmpc.program, row, v, t, own) for row, v, own in zip(x0, u, p, strict=True)]
+
+
+def _of_free(guess: Any, nmpc: NMPC, x0: Array, t: Array, p: Array) -> list[Guess]:
+    """A guess where the horizon is free: a Solution or Trajectory, which have one, or (x, u) of a middling one."""
+    if not (_is_solution(guess) or isinstance(guess, tuple)):
+        raise ValueError(f"NMPC: the guess is a {type(guess).__name__}, which says no horizon, and that is free; "
+                         "expected a Solution, a Trajectory, or states and controls (x [B, N+1, nx], u [B, N, nu])")
+    s, N, B = nmpc.ocp.system, nmpc.intervals, len(x0)
+    x, u = (guess.x, guess.u) if _is_solution(guess) else guess
+    nodes = np.broadcast_to(guess.t if _is_solution(guess) else t, (B, N + 1))
+    return list(zip(_shaped(x, (B, N + 1, s.nx), "the guess's x", "[B, N+1, nx]"),
+                    _shaped(u, (B, N, s.nu), "the guess's u", "[B, N, nu]"), nodes, strict=True))
 
 
 def _rollout(program: Transcription, x0: Array, u: Array, t: Array, p: Array) -> Guess:

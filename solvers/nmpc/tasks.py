@@ -9,10 +9,20 @@ from typing import Any
 
 import numpy as np
 
+from nocl.constraints import PATH
 from nocl.data import Solution
 from nocl.ocp import OCP
 from nocl.solvers.nmpc.guesses import Guess
-from nocl.solvers.nmpc.transcription import FEASIBLE, GIVEN_UP, INFEASIBLE, NOT_A_NUMBER, STOPPED, Answer, Transcription
+from nocl.solvers.nmpc.transcription import (
+    FEASIBLE,
+    GIVEN_UP,
+    INFEASIBLE,
+    NOT_A_NUMBER,
+    NOT_HELD,
+    STOPPED,
+    Answer,
+    Transcription,
+)
 from nocl.support.checks import Array
 
 
@@ -70,12 +80,13 @@ def _answer(arrays: dict[str, Any], kind: str) -> Answer | None:
 
 def attempt(program: Transcription, task: Task, guesses: Sequence[Guess]) -> Outcome:
     """Solve from each guess."""
-    begin, answers, at = time.perf_counter(), list[Answer](), (task.x0, task.t)
-    for i, (x, u) in enumerate(guesses):
-        one = (*at, x, u, task.time_limit, task.p)
+    begin, answers = time.perf_counter(), list[Answer]()
+    for i, (x, u, *nodes) in enumerate(guesses):
+        one = (task.x0, nodes[0] if nodes else task.t, x, u, task.time_limit, task.p)
         warm = program.warm.solve(*one) if i < task.warm else None
         answers.append(warm if warm is not None and warm.success else program.solve(*one))
     answers += _second_opinion(program, task, answers)
+    answers += _third_opinion(program, task, answers)
     seconds = time.perf_counter() - begin
     good, bad = ([a for a in answers if bool(a.success) is ok] for ok in (True, False))
     return Outcome(task.name, task.row, np.array([a.cost for a in answers]), seconds,
@@ -101,8 +112,33 @@ def _second_opinion(program: Transcription, task: Task, answers: Sequence[Answer
 
 
 def _by_ipopt(program: Transcription, task: Task, start: Answer) -> Answer:
-    answer = program.second.solve(task.x0, task.t, start.x, start.u, task.time_limit, task.p)
+    t = task.t if start.t is None else start.t
+    answer = program.second.solve(task.x0, t, start.x, start.u, task.time_limit, task.p)
     return replace(answer, message=f"{answer.message}, by IPOPT after fatrop: {start.message}")
+
+
+def _third_opinion(program: Transcription, task: Task, answers: Sequence[Answer]) -> list[Answer]:
+    """Where nothing was solved: the plan that comes nearest to holding all constraints, which is a start if it holds
+    them, and else says what cannot be held, where and by how much.
+
+    Problems with path constraints alone are told without it.
+    """
+    if not program.ocp.in_scales or not program.held.hard or any(a.success for a in answers):
+        return []
+    stuck = [a for a in answers if np.isfinite(a.x).all() and np.isfinite(a.u).all()]
+    if not stuck:
+        return []
+    start = min(stuck, key=lambda a: a.violation)
+    t = task.t if start.t is None else start.t
+    near = program.elastic.solve(task.x0, t, start.x, start.u, task.time_limit, task.p)
+    if not near.success:
+        return []
+    t = t if near.t is None else near.t
+    most, where = program.elastic.worst_slack(t, near.x, near.u, task.p)
+    if most <= FEASIBLE:
+        return [program.second.solve(task.x0, t, near.x, near.u, task.time_limit, task.p)]
+    why = f"infeasible: no plan was found that holds all constraints; of the one that comes nearest, {where}"
+    return [replace(near, success=False, cost=np.inf, outcome=NOT_HELD, violation=most, message=why)]
 
 
 def solved_by(ocp: OCP, t: Array, outcomes: Sequence[Outcome], p: Array | None = None) -> Solution:
@@ -115,6 +151,8 @@ def solved_by(ocp: OCP, t: Array, outcomes: Sequence[Outcome], p: Array | None =
         if outcome.best is not None:
             found.x[i], found.u[i], found.V_x[i] = outcome.best.x, outcome.best.u, outcome.best.costate
             found.cost[i], found.success[i] = outcome.best.cost, True
+            if outcome.best.t is not None:
+                found.t[i] = outcome.best.t
             if found.V_p is not None and outcome.best.V_p is not None:
                 found.V_p[i] = outcome.best.V_p
     return replace(found, tried=tried, message=np.array([o.best.message if o.best else "" for o in outcomes], np.str_),
@@ -130,15 +168,16 @@ def failure(program: Transcription, x0: Array, starts: int, failed: Answer | Non
 
 
 def _remedy(outcome: str, program: Transcription) -> str:
-    if program.ocp.kinks and outcome not in (INFEASIBLE, GIVEN_UP):
+    if program.ocp.kinks and outcome not in (INFEASIBLE, NOT_HELD, GIVEN_UP):
         return f"a smooth problem: {program.ocp.not_smooth}"
     if outcome == STOPPED:
         return f"more iterations (options={{'{program.backend}.max_iter': 3000}}), more starts or another guess"
     if outcome == GIVEN_UP:
         return "another solver (solver='ipopt'), more starts, another guess, or a longer time_limit"
-    soft = ", or constraints='soft'" if program.n_path else ""
-    if outcome == INFEASIBLE and program.n_path:
-        held = " and ".join(map(repr, program.ocp.path_constraints))
+    hard = program.held.hard
+    soft = f", or soft={list(hard)}" if hard and program.ocp.in_scales else ", or constraints='soft'" if hard else ""
+    if outcome in (INFEASIBLE, NOT_HELD) and hard:
+        held = " and ".join(map(repr, hard))
         return (f"another initial state, or wider bounds of the controls, where none of them holds {held} from there; "
                 f"else more starts or another guess{soft}")
     if outcome == NOT_A_NUMBER:
@@ -148,14 +187,18 @@ def _remedy(outcome: str, program: Transcription) -> str:
 
 def violated_start(program: Transcription, x0: Array, t: float = 0.0, p: Array | None = None) -> str:
     """Why x0 at time t is no start at all: inside an obstacle that no control can undo."""
-    if not program.n_path:
+    block, of = program.held.x, program.functions
+    if not len(block):
         return ""
-    h = program.ocp.h(x0, *program.moment(t, p)).full().ravel()
-    i = int(np.argmin(h))
-    if h[i] >= -FEASIBLE:
+    c = of.c_of_x(x0, *program.moment(t, p)).full()
+    c = np.where(block.slack.any(axis=1), np.inf, block.rows.signed(c)[:, 0])  # what is soft has a slack for it
+    unit = np.where([one.kind == PATH for one in block.rows.of], 1.0, block.scales)
+    i = int(np.argmin(c / unit))
+    if c[i] >= -FEASIBLE * unit[i]:
         return ""
-    return (f"infeasible: path constraint {list(program.ocp.path_constraints)[i]!r} is violated by {-h[i]:.3g} at node "
-            f"0, by x0 = {_text(x0)}{_at(program, p)} itself: move x0, or use constraints='soft'")
+    remedy = f"soft=[{block.rows.names[i]!r}]" if program.ocp.in_scales else "constraints='soft'"
+    return (f"infeasible: {block.rows.title(i)} is violated by {-c[i]:.3g} at node 0, by x0 = {_text(x0)}"
+            f"{_at(program, p)} itself: move x0, or use {remedy}")
 
 
 def outside(program: Transcription, x0: Array) -> str:

@@ -2,8 +2,10 @@
 
 Variables w = [x_0, u_0, x_1, u_1, ..., x_N], parameters p = [x_0, h_0, ..., h_{N-1}, t_N], the lengths of the
 intervals and the time of the last node, then the parameters of the problem.
-Constraints, stage by stage: x_{k+1} - F(x_k, u_k; h_k) = 0, then x_0 - p = 0 at k = 0 and h(x_k) >= 0 at k >= 1. A
-gap's multiplier is minus the costate of the node that it leads to: lambda_{k+1} = dJ*/dx_{k+1}.
+Constraints, stage by stage: x_{k+1} - F(x_k, u_k; h_k) = 0, then x_0 - p = 0 at k = 0 and the problem's own
+(held.py). A free horizon T stands behind the state of each node, T_{k+1} = T_k, and h_k are then shares of it. A soft
+constraint has slacks behind u_k. A gap's multiplier is minus the costate of the node that it leads to:
+lambda_{k+1} = dJ*/dx_{k+1}.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ import numpy as np
 from nocl.functions import Functions
 from nocl.ocp import OCP
 from nocl.scales import steps, units
+from nocl.solvers.nmpc.held import Block, Layout, layout
 from nocl.support import compiler
 from nocl.support.checks import Array
 from nocl.support.guard import Guarded, NoAnswerError
@@ -43,7 +46,8 @@ OUTCOMES = {"SOLVER_RET_SUCCESS": "solved", "SOLVER_RET_LIMITED": "stopped at it
             "SOLVER_RET_INFEASIBLE": "infeasible", "SOLVER_RET_NAN": "NaN in a function",
             "SOLVER_RET_UNKNOWN": "not converged"}
 STOPPED, NOT_A_NUMBER, INFEASIBLE = "SOLVER_RET_LIMITED", "SOLVER_RET_NAN", "SOLVER_RET_INFEASIBLE"
-GIVEN_UP = "given up"  # an outcome of our own: the solver did not come back
+GIVEN_UP = "given up"  # outcomes of our own: the solver did not come back,
+NOT_HELD = "not held"  # and constraints that not even the nearest plan holds
 LEAST = 10.0  # seconds that a solve has, without a time limit of the user's
 OTHERS = 20.0  # ... or that many times the slowest that came back
 WORK = 10.0  # ... or that many evaluations of the second derivatives in each iteration allowed
@@ -65,11 +69,13 @@ class Answer:
     iterations: int
     outcome: str  # how it ended: a key of OUTCOMES, GIVEN_UP, or CasADi's own name
     V_p: Array | None = None  # [np], dJ*/dp, where there are parameters
+    t: Array | None = None  # [N+1], the nodes, where the horizon is free
 
     @property
-    def rank(self) -> tuple[bool, float]:
-        """Of failures: the one that says that there is no solution comes first, then the most feasible."""
-        return self.outcome != INFEASIBLE, self.violation
+    def rank(self) -> tuple[int, float]:
+        """Of failures: the one that says which constraint cannot be held comes first, then those that say that there is
+        no solution, then the most feasible."""
+        return {NOT_HELD: 0, INFEASIBLE: 1}.get(self.outcome, 2), self.violation
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +106,7 @@ class Transcription:
     options: tuple[tuple[str, Any], ...] = ()
     terminal: ca.Function | None = None  # (x), (x, t) or (x, t, p) -> cost at the last node; default: G
     compiled: tuple[str, Path] | None = None  # (the program's key, cache folder) of compiled functions; or interpreted
+    eased: tuple[str, ...] = ()  # constraints that an exact penalty holds, by name
 
     @cached_property
     def functions(self) -> Functions:
@@ -123,8 +130,18 @@ class Transcription:
 
     @property
     def n_path(self) -> int:
-        """Path constraints at each node."""
-        return 0 if self.soft else len(self.ocp.path_constraints)
+        """Inequalities of x alone at each node, h."""
+        return 0 if self.soft else self.functions.rows.n_h
+
+    @cached_property
+    def held(self) -> Layout:
+        """The constraints, by where they stand."""
+        return layout(self.ocp, self.eased, not self.soft)
+
+    @property
+    def free(self) -> int:
+        """How many variables of a node the horizon is: T, the same at all nodes, where it is free."""
+        return int(self.ocp.is_free)
 
     @cached_property
     def step(self) -> ca.Function:
@@ -148,25 +165,45 @@ class Transcription:
     @cached_property
     def program(self) -> dict[str, ca.MX]:
         """x, p, f, g of the nonlinear program, in MX."""
-        s, N = self.ocp.system, self.N
-        X, U = ca.MX.sym("x", s.nx, N + 1), ca.MX.sym("u", s.nu, N)
+        s, N, m = self.ocp.system, self.N, self.held.slacks
+        X, U, S = ca.MX.sym("x", s.nx + self.free, N + 1), ca.MX.sym("u", s.nu, N), ca.MX.sym("slack", m, N + 1)
         p = ca.MX.sym("p", s.nx + N + 1 + self.ocp.np)
-        h, end, own = p[s.nx: s.nx + N].T, p[s.nx + N], p[s.nx + N + 1:]
-        t = self._times(h, end) if self.ocp.uses_time else end
-        stages = Arguments({"x": X[:, :-1], "u": U, "t": t[:, :-1], "p": ca.repmat(own, 1, N)})
-        ends, costs = self.step.map(N)(*(stages[name] for name in self.functions.arguments.names), h)
-        gaps = ca.horzsplit(X[:, 1:] - ends)
-        nodes = (Arguments({"x": X[:, k], "t": t[min(k, t.numel() - 1)], "p": own}) for k in range(1, N + 1))
-        paths = [X[:, 0] - p[: s.nx], *([node.call(self.ocp.h) for node in nodes] if self.n_path else [])]
-        w = ca.vertcat(*(v for k in range(N) for v in (X[:, k], U[:, k])), X[:, N])
-        g = ca.vertcat(*(v for k in range(N) for v in (gaps[k], *paths[k: k + 1])), *paths[N:])
-        flat = ca.Function("flat", [X, U, p], [w, ca.sum2(costs) + self.end_cost(X[:, N], end, own), g])
+        w = ca.vertcat(*(v for k in range(N) for v in (X[:, k], U[:, k], S[:, k])), X[:, N], S[:, N])
+        flat = ca.Function("flat", [X, U, S, p], [w, *self._cost_and_rows(X, U, S, p)])
         w_sym, scales = ca.MX.sym("w", w.numel()), self.scales
-        states, controls = self.split(w_sym if scales.ordinary else w_sym * scales.w)
-        _, cost, constraints = flat(states, controls, p)
+        _, cost, constraints = flat(*self._split(w_sym if scales.ordinary else w_sym * scales.w), p)
         if not scales.ordinary:
             cost, constraints = cost / scales.cost, constraints / scales.g
         return {"x": w_sym, "p": p, "f": cost, "g": constraints}
+
+    def _cost_and_rows(self, X: ca.MX, U: ca.MX, S: ca.MX, p: ca.MX) -> tuple[ca.MX, ca.MX]:
+        """(cost, g) of states [nx (+ T), N+1], controls [nu, N], slacks [slacks, N+1] and parameters."""
+        s, N = self.ocp.system, self.N
+        h, end, own, x = p[s.nx: s.nx + N].T, p[s.nx + N], p[s.nx + N + 1:], X[:s.nx, :]
+        t = self._times(h, end) if self.ocp.uses_time else end
+        if self.free:
+            T = X[s.nx, :]
+            h, end, t = h * T[:N], T[N], t * (T if self.ocp.uses_time else T[N])
+        stages = Arguments({"x": x[:, :-1], "u": U, "t": t[:, :-1], "p": ca.repmat(own, 1, N)})
+        ends, costs = self.step.map(N)(*(stages[name] for name in self.functions.arguments.names), h)
+        if self.free:
+            ends = ca.vertcat(ends, X[s.nx, :-1])
+        gaps, paths = ca.horzsplit(X[:, 1:] - ends), [ca.vertcat(x[:, 0] - p[: s.nx], *self._rows(0, x, U, S, t, own))]
+        paths += [ca.vertcat(ca.MX(0, 1), *self._rows(k, x, U, S, t, own)) for k in range(1, N + 1)]
+        g = ca.vertcat(*(v for k in range(N) for v in (gaps[k], *paths[k: k + 1])), *paths[N:])
+        cost = ca.sum2(costs) + self.end_cost(x[:, N], end, own)
+        return (cost + self.held.weight * ca.sum1(ca.sum2(S)) if self.held.slacks else cost), g
+
+    def _rows(self, k: int, x: ca.MX, U: ca.MX, S: ca.MX, t: ca.MX, p: ca.MX) -> list[ca.MX]:
+        """The constraints at node k, in their own units."""
+        of, held = self.functions, self.held
+        node = Arguments({"x": x[:, k], "u": U[:, min(k, self.N - 1)], "t": t[min(k, t.numel() - 1)], "p": p})
+        found = []
+        for block, c in ((held.x, of.c_of_x), (held.u, of.c_of_u), (held.end, of.c_at_end)):
+            if len(block) and block in held.at(k, self.N):
+                value = node.call(c)
+                found.append(value + ca.DM(block.slack) @ S[:, k] if block.slack.any() else value)
+        return found
 
     def _times(self, h: ca.MX, end: ca.MX) -> ca.MX:
         """The times of the nodes [1, N+1] from the lengths of the intervals [1, N] and the time of the last one."""
@@ -181,17 +218,20 @@ class Transcription:
     def scales(self) -> Scales:
         """The sizes that the solver sees as 1, in steps of about a thousand: most problems are solved as they stand."""
         N, of = self.N, units(self.ocp)
-        x, u = of.x, of.u
-        h = steps(self.ocp.constraint_scales) if self.n_path else np.zeros(0)
-        w = np.r_[np.tile(np.r_[x, u], N), x]
-        return Scales(w, np.r_[x, x, np.tile(np.r_[h, x], N - 1), h], of.cost, x)
+        T, slacks = steps(np.full(self.free, self.ocp.longest)), np.ones(self.held.slacks)
+        w = np.r_[np.tile(np.r_[of.x, T, of.u, slacks], N), of.x, T, slacks]
+        rows = [[block.unit for block in self.held.at(k, N)] for k in range(N + 1)]
+        g = [of.x, T, of.x, *rows[0], *(part for k in range(1, N) for part in (of.x, T, *rows[k])), *rows[N]]
+        return Scales(w, np.concatenate(g), of.cost, of.x)
 
-    def split(self, w: Any) -> tuple[Any, Any]:
-        """(X [nx, N+1], U [nu, N]) of the interleaved variables."""
-        s = self.ocp.system
-        n = s.nx + s.nu
-        inner = ca.reshape(w[: n * self.N], n, self.N)
-        return ca.horzcat(inner[: s.nx, :], w[n * self.N:]), inner[s.nx:, :]
+    def _split(self, w: Any) -> tuple[Any, Any, Any]:
+        """(X [nx (+ T), N+1], U [nu, N], slacks [slacks, N+1]) of the interleaved variables."""
+        s, N = self.ocp.system, self.N
+        n, nu = s.nx + self.free, s.nu
+        size = n + nu + self.held.slacks
+        inner, last = ca.reshape(w[: size * N], size, N), w[size * N:]
+        return (ca.horzcat(inner[:n, :], last[:n]), inner[n: n + nu, :],
+                ca.horzcat(inner[n + nu:, :], last[n:]))
 
     @cached_property
     def solver(self) -> ca.Function:
@@ -214,12 +254,13 @@ class Transcription:
         return library
 
     def _nlpsol(self, problem: Any, options: dict[str, Any]) -> ca.Function:
-        s, N, m = self.ocp.system, self.N, self.n_path
+        s, N, m = self.ocp.system, self.N, self.held.slacks
         options = {"print_time": False, "error_on_fail": False, "show_eval_warnings": False, **options,
                    **BACKENDS.get(self.backend, {})}
         if self.backend == "fatrop":
-            options |= {"structure_detection": "manual", "N": N, "nx": [s.nx] * (N + 1), "nu": [s.nu] * N + [0],
-                        "ng": [s.nx] + [m] * N}
+            options |= {"structure_detection": "manual", "N": N, "nx": [s.nx + self.free] * (N + 1),
+                        "nu": [s.nu + m] * N + [m],
+                        "ng": [s.nx * (k == 0) + self.held.size(k, N) for k in range(N + 1)]}
         try:
             return ca.nlpsol("nmpc", self.backend, problem, {**options, **dict(self.options)})
         except RuntimeError as error:
@@ -229,12 +270,15 @@ class Transcription:
 
     @cached_property
     def bounds(self) -> dict[str, Array]:
-        s, N, m = self.ocp.system, self.N, self.n_path
-        free = np.full(s.nx, np.inf)
-        stage = np.concatenate([np.zeros(s.nx), np.full(m, np.inf)])
-        ubg = np.concatenate([np.zeros(2 * s.nx), np.tile(stage, N - 1), np.full(m, np.inf)])
-        return {"lbx": np.concatenate([np.tile(np.r_[-free, s.lbu], N), -free]) / self.scales.w,
-                "ubx": np.concatenate([np.tile(np.r_[free, s.ubu], N), free]) / self.scales.w,
+        s, N, horizon, slacks = self.ocp.system, self.N, self.ocp.horizon, self.held.slacks
+        any_x, T = np.full(s.nx, np.inf), [(horizon.low, horizon.high)] if self.free else []
+        low, high = (np.array([pair[i] for pair in T]) for i in (0, 1))
+        lbx = [np.tile(np.r_[-any_x, low, s.lbu, np.zeros(slacks)], N), -any_x, low, np.zeros(slacks)]
+        ubx = [np.tile(np.r_[any_x, high, s.ubu, np.full(slacks, np.inf)], N), any_x, high, np.full(slacks, np.inf)]
+        gap, rows = np.zeros(s.nx + self.free), [[b.upper for b in self.held.at(k, N)] for k in range(N + 1)]
+        ubg = np.concatenate([gap, np.zeros(s.nx), *rows[0],
+                              *(part for k in range(1, N) for part in (gap, *rows[k])), *rows[N]])
+        return {"lbx": np.concatenate(lbx) / self.scales.w, "ubx": np.concatenate(ubx) / self.scales.w,
                 "lbg": np.zeros(len(ubg)), "ubg": ubg}
 
     @cached_property
@@ -245,9 +289,22 @@ class Transcription:
     @cached_property
     def gap_rows(self) -> Array:
         """Where x_0 - p and the gaps stand in g, [N+1, nx]."""
-        s, N, m = self.ocp.system, self.N, self.n_path
-        first = np.r_[s.nx, 0, 2 * s.nx + (s.nx + m) * np.arange(N - 1)]
+        s, N = self.ocp.system, self.N
+        n = s.nx + self.free
+        stages = [n + self.held.size(k, N) + s.nx * (k == 0) for k in range(N)]
+        first = np.r_[n, np.cumsum([0, *stages])[:N]].astype(np.int64)
         return first[:, None] + np.arange(s.nx)
+
+    @cached_property
+    def row_titles(self) -> list[tuple[str, int]]:
+        """What each row of g is, in words, and its node."""
+        s, N = self.ocp.system, self.N
+        x, T = [f"the dynamics of {name}" for name in s.state_names], ["the horizon"] * self.free
+        held = [[block.rows.title(i) for block in self.held.at(k, N) for i in range(len(block))] for k in range(N + 1)]
+        found = [(what, k + 1) for k in range(N) for what in (*x, *T)]
+        stages = [found[k * len(x + T):(k + 1) * len(x + T)] + [(what, k) for what in (*x * (k == 0), *held[k])]
+                  for k in range(N)]
+        return [row for stage in stages for row in stage] + [(what, N) for what in held[N]]
 
     def solve(self, x0: Array, t: Array, x: Array, u: Array, time_limit: float | None = None,
               p: Array | None = None) -> Answer:
@@ -261,7 +318,7 @@ class Transcription:
             answer: Answer = self._guarded(self.patience if time_limit is None else time_limit, x0, t, x, u,
                                             np.zeros(0) if p is None else p)
         except NoAnswerError as error:
-            return self._no_answer(x, u, f"was given up: {error}")
+            return self._no_answer(t, x, u, f"was given up: {error}")
         self._took[0] = max(self._took[0], time.perf_counter() - begin)
         return answer
 
@@ -290,7 +347,7 @@ class Transcription:
     def _rehearse(self) -> None:
         for name in self.solver.get_function():
             _at_zero(self.solver.get_function(name))
-        self.split(ca.DM.zeros(self.solver.sparsity_in(0)))
+        self._split(ca.DM.zeros(self.solver.sparsity_in(0)))
 
     @cached_property
     def _evaluation(self) -> float:
@@ -305,26 +362,66 @@ class Transcription:
             took.append(time.perf_counter() - begin)
         return min(took)
 
-    def _no_answer(self, x: Array, u: Array, why: str) -> Answer:
+    def _no_answer(self, t: Array, x: Array, u: Array, why: str) -> Answer:
         """A failure of the solver itself, which leaves the guess."""
-        return Answer(x, u, np.full_like(x, np.nan), np.inf, False, f"{self.backend} {why}", np.inf, 0, GIVEN_UP)
+        return Answer(x, u, np.full_like(x, np.nan), np.inf, False, f"{self.backend} {why}", np.inf, 0, GIVEN_UP,
+                      t=t if self.free else None)
+
+    def _start(self, t: Array, x: Array, u: Array, p: Array) -> Array:
+        """The variables of a guess; slacks are what it takes to hold the soft constraints."""
+        T = np.full((len(t), self.free), t[-1])
+        S = self.needed(t, x, u, p)
+        return np.r_[np.c_[x[:-1], T[:-1], u, S[:-1]].ravel(), x[-1], T[-1], S[-1]]
+
+    def needed(self, t: Array, x: Array, u: Array, p: Array) -> Array:
+        """The slacks [N+1, slacks] that hold the soft constraints at states x [N+1, nx], controls u [N, nu]."""
+        of, held, N = self.functions, self.held, self.N
+        found = np.zeros((N + 1, held.slacks))
+        if not held.slacks:
+            return found
+        own = np.tile(p, (N + 1, 1))
+        given = {"x": x, "t": t, "p": own}
+        self._add(found[1:], held.x, of.c_of_x(*of.node.columns(**given)).full()[:, 1:])
+        now = {"x": x[:-1], "u": u, "t": t[:-1], "p": own[:-1]}
+        self._add(found[:-1], held.u, of.c_of_u(*of.arguments.columns(**now)).full())
+        self._add(found[-1:], held.end, of.c_at_end(*of.end.columns(x=x[-1:], p=own[-1:])).full())
+        return found
+
+    def slack(self, t: Array, x: Array, u: Array, p: Array | None) -> Array:
+        """By how much each soft constraint is exceeded at each node [N+1, soft ones], as a share of its scale."""
+        S, held = self.needed(t, x, u, np.zeros(0) if p is None else p), self.held
+        found = np.zeros((len(t), len(self.eased)))
+        for block in (held.x, held.u, held.end):
+            for i, j in np.argwhere(block.slack):
+                k = self.eased.index(block.rows.names[i])
+                found[:, k] = np.maximum(found[:, k], S[:, j])
+        return found
+
+    @staticmethod
+    def _add(slacks: Array, block: Block, c: Array) -> None:
+        """What a block's values c [m, n] need, written to the slacks [n, all]; an equation has two of them."""
+        if not len(block):
+            return
+        need = -c / block.scales[:, None]
+        for j in np.flatnonzero(block.slack.any(axis=0)):
+            i = int(np.flatnonzero(block.slack[:, j])[0])
+            slacks[:, j] = np.maximum(np.sign(block.slack[i, j]) * need[i], 0.0)
 
     def _solve(self, x0: Array, t: Array, x: Array, u: Array, own: Array) -> Answer:
-        w0 = np.r_[np.c_[x[:-1], u].ravel(), x[-1]]
-        solver, p = self.solver, np.r_[x0, np.diff(t), t[-1], own]
-        scales = self.scales
+        w0, ends = self._start(t, x, u, own), t / t[-1] if self.free else t
         try:
-            result = solver(x0=w0 / scales.w, p=p, **self._limits)
+            result = self.solver(x0=w0 / self.scales.w, p=np.r_[x0, np.diff(ends), ends[-1], own], **self._limits)
         except RuntimeError as error:  # of the library: it fails one start, not the batch
-            return self._no_answer(x, u, f"ended with an error: {str(error).strip().splitlines()[-1]}")
-        stats = solver.stats()
-        X, U = (v.full().T for v in self.split(result["x"] * scales.w))
-        U = np.clip(U, self.ocp.system.lbu, self.ocp.system.ubu)  # IPOPT relaxes bounds by 1e-8
-        costate = -result["lam_g"].full().ravel()[self.gap_rows] * scales.cost / scales.x
+            return self._no_answer(t, x, u, f"ended with an error: {str(error).strip().splitlines()[-1]}")
+        return self._answer(result, self.solver.stats(), ends, own)
+
+    def _answer(self, result: dict[str, ca.DM], stats: dict[str, Any], ends: Array, own: Array) -> Answer:
+        """What the solver found; ends: the nodes, as shares of T where that is free."""
+        X, U, t, cost = self._plan(result, ends, own)
+        costate = -result["lam_g"].full().ravel()[self.gap_rows] * self.scales.cost / self.scales.x
         worst, where = self.violation(result["g"].full().ravel(), t)
         iterations = int(stats.get("iter_count", 0))
         outcome = outcome_of(stats, iterations >= self.max_iter)
-        cost = float(result["f"]) * scales.cost
         finite = bool(np.isfinite(cost) and np.isfinite(X).all())
         if stats["success"] and not finite:  # fatrop calls a cost of NaN solved
             outcome = NOT_A_NUMBER
@@ -333,8 +430,19 @@ class Transcription:
         if not success:
             status += f"; worst violation {where}" if worst > FEASIBLE else \
                 ", at a feasible point that may not be optimal"
-        V_p = -result["lam_p"].full().ravel()[len(p) - len(own):] * scales.cost if len(own) else None
-        return Answer(X, U, costate, cost if success else np.inf, success, status, worst, iterations, outcome, V_p)
+        V_p = -result["lam_p"].full().ravel()[-len(own):] * self.scales.cost if len(own) else None
+        return Answer(X, U, costate, cost if success else np.inf, success, status, worst, iterations, outcome, V_p,
+                      t if self.free else None)
+
+    def _plan(self, result: dict[str, ca.DM], ends: Array, own: Array) -> tuple[Array, Array, Array, float]:
+        """(x [N+1, nx], u [N, nu], t [N+1], cost) of what the solver found."""
+        s, cost = self.ocp.system, float(result["f"]) * self.scales.cost
+        X, U, S = (v.full().T for v in self._split(result["x"] * self.scales.w))
+        U = np.clip(U, s.lbu, s.ubu)  # IPOPT relaxes bounds by 1e-8
+        X, t = X[:, :s.nx], ends * X[0, s.nx] if self.free else ends
+        if self.held.slacks:  # whose bounds it relaxes, too
+            cost += self.held.weight * float((self.needed(t, X, U, own) - S).sum())
+        return X, U, t, cost
 
     @property
     def max_iter(self) -> float:
@@ -354,18 +462,26 @@ class Transcription:
 
     def violation(self, g: Array, t: Array) -> tuple[float, str]:
         """(largest violation of a constraint, scaled; how much, in its unit, of what, state, node, time)."""
-        s = self.ocp.system
         excess = np.maximum(self.bounds["lbg"] - g, g - self.bounds["ubg"])
         excess = np.where(np.isnan(excess), np.inf, excess)
         row = int(np.argmax(excess))
-        node, state = np.argwhere(self.gap_rows == row)[0] if (self.gap_rows == row).any() else (-1, -1)
-        if node >= 0:
-            what = f"the dynamics of {s.state_names[state]}"
-        else:
-            path = np.setdiff1d(np.arange(len(g)), self.gap_rows)  # node by node, from node 1
-            i = int(np.flatnonzero(path == row)[0])
-            node, what = 1 + i // self.n_path, f"path constraint {list(self.ocp.path_constraints)[i % self.n_path]!r}"
+        what, node = self.row_titles[row]
         return float(excess[row]), f"{excess[row] * self.scales.g[row]:.3g} of {what} at node {node}, t = {t[node]:.4g}"
+
+    @cached_property
+    def elastic(self) -> Transcription:
+        """The same program, all constraints soft, for IPOPT: what comes nearest to holding them."""
+        return replace(self, backend="ipopt", options=(), compiled=None, eased=self.ocp.constraint_names)
+
+    def worst_slack(self, t: Array, x: Array, u: Array, p: Array | None) -> tuple[float, str]:
+        """(the largest violation of a soft constraint, as a share of its scale; how much, in its unit, of what, where).
+        """
+        S, held = self.needed(t, x, u, np.zeros(0) if p is None else p), self.held
+        node, j = np.unravel_index(int(np.argmax(S)), S.shape)
+        block, i = next((b, int(np.flatnonzero(b.slack[:, j])[0])) for b in (held.x, held.u, held.end)
+                        if len(b) and b.slack[:, j].any())
+        return float(S[node, j]), (f"{block.rows.title(i)} is exceeded by {S[node, j] * block.scales[i]:.3g} at node "
+                                   f"{node}, t = {t[node]:.4g}")
 
 
 def _at_zero(function: ca.Function) -> None:
