@@ -9,8 +9,10 @@ from functools import cached_property
 
 import casadi as ca
 import numpy as np
+from scipy.optimize import nnls
 
 import nocl
+from nocl.data import Solution
 from nocl.solvers.ddp.constraints import Block, ConstraintRows
 
 WARM = {"ipopt.mu_init": 1e-8, "ipopt.bound_push": 1e-9, "ipopt.bound_frac": 1e-9, "ipopt.slack_bound_push": 1e-9,
@@ -88,7 +90,7 @@ PROBLEMS = {"cartpole": cartpole, "dubins": dubins, "point": point, "planar_quad
 
 
 class Shooting:
-    """The nonlinear program of a problem from (x0, h), for any number of intervals; variables u_0, x_1, u_1, ... x_K."""
+    """The nonlinear program of a problem from (x0, h); its variables are u_0, x_1, u_1, ... x_K."""
 
     def __init__(self, problem: Problem, intervals: int, solver: str = "ipopt") -> None:
         self.problem, self.K = problem, intervals
@@ -109,7 +111,7 @@ class Shooting:
         cost, x, g, lower, upper = ca.MX(0), x0, [], [], []
         self.node = []  # of each row of g: k for what follows from (x_k, u_k)
         for k in range(self.K):
-            u, after = self._parts(z, k)
+            u, after = self.parts(z, k)
             rows = (self.first if k == 0 else self.stage)(x, u)
             following, c = self.step(x, u, h)
             cost += c
@@ -128,7 +130,7 @@ class Shooting:
         self.z, self.x0, self.h, self.cost, self.g = z, x0, h, cost, ca.vertcat(*g)
         self.lower, self.upper = np.array(lower), np.array(upper)
 
-    def _parts(self, z: ca.MX, k: int) -> tuple[ca.MX, ca.MX]:
+    def parts(self, z: ca.MX, k: int) -> tuple[ca.MX, ca.MX]:
         at = k * (self.n + self.m)
         return z[at:at + self.m], z[at + self.m:at + self.m + self.n]
 
@@ -209,9 +211,10 @@ def holds_control(c: ca.SX, u: ca.SX) -> bool:
 def rk4_step(ocp: nocl.OCP) -> ca.Function:
     """(x, u, h) -> (x after h, its cost), one step with u held."""
     x, u, h = ca.SX.sym("x", ocp.system.nx), ca.SX.sym("u", ocp.system.nu), ca.SX.sym("h")
+    of = ca.Function("of", [ocp.system.x, ocp.system.u], [ca.vertcat(ocp.system.xdot, ocp.running)])
 
     def slope(z):
-        return ca.vertcat(ocp.system.f(z[:-1], u), ocp.L(z[:-1], u))
+        return of(z[:-1], u)
 
     z = ca.vertcat(x, 0)
     k1 = slope(z)
@@ -220,3 +223,47 @@ def rk4_step(ocp: nocl.OCP) -> ca.Function:
     k4 = slope(z + h * k3)
     z = z + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
     return ca.Function("step", [x, u, h], [z[:-1], z[-1]]).expand()
+
+
+def kkt_residual(problem: Problem, s: Solution, i: int, p: np.ndarray | None = None) -> float:
+    """How far row i of a solution is from the first-order conditions, its V_x the costates, relative to them.
+
+    At each node some multipliers >= 0 of the rows that are active there, and of controls at their limits, must make up
+    what is left of the Lagrangian's slope: the best ones are found by least squares.
+    """
+    ocp, h, worst = problem.ocp, s.t[i, 1] - s.t[i, 0], 0.0
+    z, u, system = ca.vertcat(ocp.system.x, ocp.system.u), ocp.system.u, ocp.system
+    step = rk4_step(ocp)
+    after, cost = step(system.x, u, h)
+    slopes = ca.Function("slopes", [z], [ca.jacobian(after, z), ca.gradient(cost, z)])
+    stage, end = (rows_and_slopes(part, z, ocp.p) for part in (problem.stage, problem.end + problem.equal))
+    p = np.zeros(0) if p is None else p
+    here = np.r_[s.x[i, -1], np.zeros(system.nu)]
+    G_x = ca.Function("G_x", [system.x], [ca.gradient(ocp.terminal, system.x)])(s.x[i, -1]).full().ravel()
+    left = np.r_[G_x - s.V_x[i, -1], np.zeros(system.nu)]
+    worst = unexplained(left, *end(here, p), len(problem.equal))
+    for k in range(s.u.shape[1]):
+        here = np.r_[s.x[i, k], s.u[i, k]]
+        F, l_z = (d.full() for d in slopes(here))
+        left = l_z.ravel() + F.T @ s.V_x[i, k + 1] - np.r_[s.V_x[i, k], np.zeros(system.nu)]
+        c, C = stage(here, p)
+        push = np.hstack([np.zeros((system.nu, system.nx)), np.eye(system.nu)])
+        c = np.r_[c.full().ravel(), s.u[i, k] - system.lbu, system.ubu - s.u[i, k]]
+        C = np.vstack([C.full(), push, -push])
+        if k == 0:
+            c = np.where(np.abs(C[:, system.nx:]).max(axis=1) > 0, c, np.inf)
+        worst = max(worst, unexplained(left, c, C, 0))
+    return worst / np.abs(s.V_x[i]).max()
+
+
+def rows_and_slopes(rows: list[tuple[str, ca.SX, float]], z: ca.SX, p: ca.SX) -> ca.Function:
+    c = ca.vertcat(ca.SX(0, 1), *(c / scale for _, c, scale in rows))
+    return ca.Function("rows", [z, p], [ca.densify(c), ca.densify(ca.jacobian(c, z))])
+
+
+def unexplained(slope: np.ndarray, c, C, equalities: int) -> float:
+    """|slope - C'a| for the best multipliers a of active rows, >= 0 but for the last ones, equalities."""
+    c, C = np.array(c).ravel(), np.array(C).reshape(-1, len(slope))
+    active = C[np.abs(c) < ACTIVE]
+    both = C[len(C) - equalities:]
+    return float(nnls(np.vstack([active, both, -both]).T, slope)[1]) if len(active) else float(np.linalg.norm(slope))

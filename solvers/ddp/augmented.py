@@ -18,17 +18,17 @@ from numpy.typing import NDArray
 
 from nocl.scales import usual_sizes
 from nocl.solvers.ddp.batch import Rows
-from nocl.solvers.ddp.work import CONVERGED, NO_DESCENT, NOT_CONVEX, NOT_HELD, Work
+from nocl.solvers.ddp.work import BLEW_UP, CONVERGED, NO_DESCENT, NOT_CONVEX, NOT_HELD, OUTSIDE, RUNNING, Work
 from nocl.support.checks import Array
 
-HELD, SMALLEST = 1e-9, 1e-12  # of a scale: the largest violation at a node, and what rounding may leave of it
+HELD = 1e-9  # of a scale: the largest violation at a node
 MULTIPLIER = 1e-7  # of the cost for a scale: what multipliers may be off by
 TOLD = 1e-6  # of a scale: what is less is not worth a message
 TOLERATED = 0.01  # of a scale: violated by so much by the initial state itself, a problem has no answer
 ROUNDING = 1e-13  # of the usual cost
 SLACK = 0.1  # of sum rho e^2 / 2, what a round may leave of the merit: 1 is too much
 ENOUGH = 0.25  # of the last round's violation: if more is left, rho grows
-LEAST, MOST, LARGEST = 1.0, 100.0, 1e7  # usual costs for a violation of one scale: rho at first, and ever
+LEAST, MOST, LARGEST = 1.0, 10.0, 1e7  # usual costs for a violation of one scale: rho at first, and ever
 SHARE = 10.0  # of the guess's cost, what rho makes of its violations at first
 RHO_GROWTH = 4.0
 STALLS = 2  # rounds at the largest rho in which the violation does not halve: it cannot be held
@@ -55,6 +55,9 @@ class Augmented(Work):
         self.last, self.stalls = np.full(B, np.inf), np.zeros(B, dtype=np.int64)
         super().__post_init__()
         self._first_penalty()
+        if d.constraints == "hard":
+            outside = self._violations()[1].max(axis=1) > TOLERATED
+            self.state[outside & (self.state == RUNNING)] = OUTSIDE
 
     def _first_penalty(self) -> None:
         """rho so that the guess's violations weigh as much as its cost, in bounds."""
@@ -63,7 +66,7 @@ class Augmented(Work):
             rho = np.clip(SHARE * cost / violation, LEAST * self.unit, MOST * self.unit)
         rho[~np.isfinite(rho)] = MOST * self.unit  # nothing is violated
         growth = rho / self.penalty[:, 0]
-        self.J = self.parts[:, 0] + growth * (self.J - self.parts[:, 0])  # with y = 0 psi is proportional to rho
+        self.J[:] = self.parts[:, 0] + growth * (self.J - self.parts[:, 0])  # with y = 0 psi is proportional to rho
         self.penalty[:, 0], self.parts[:, 1] = rho, growth * self.parts[:, 1]
 
     def _held_in(self) -> list[Array | None]:
@@ -81,14 +84,15 @@ class Augmented(Work):
         return d.settings.tolerance * np.abs(self.J[rows]) + ROUNDING * self.unit + SLACK * self.parts[rows, 1]
 
     def _held(self, rows: Rows) -> NDArray[np.bool_]:
-        """Where e is small, and with it what multipliers, and so costates, are off by: rho e."""
-        fine = MULTIPLIER * np.abs(self.parts[rows, 0]) / self.penalty[rows, 0]
-        return self.parts[rows, 2] <= np.clip(fine, SMALLEST, HELD)
+        """Where e is small, and with it rho e, which is what multipliers and so costates are off by; or falls no more.
+        """
+        worst, fine = self.parts[rows, 2], MULTIPLIER * np.abs(self.parts[rows, 0]) / self.penalty[rows, 0]
+        return (worst <= HELD) & ((worst <= fine) | (worst > ENOUGH * self.last[rows]))
 
     def _at_minimum(self, rows: Rows) -> None:
         held = self._held(rows)
         self.state[rows[held]] = CONVERGED
-        self._next_round(rows[~held], ENOUGH)
+        self._next_round(rows[~held], self.parts[rows[~held], 2] > ENOUGH * self.last[rows[~held]])
 
     def _at_saddle(self, rows: Rows) -> None:
         """Held, it is one of the problem; else a larger rho may bend the merit upwards."""
@@ -96,20 +100,18 @@ class Augmented(Work):
         self.state[rows[done]] = NOT_CONVEX
         rows = rows[~done]
         self.refused[rows], self.mu[rows] = -1.0, 0.0
-        self._next_round(rows, 0.0)
+        self._next_round(rows, np.ones(len(rows), dtype=bool))
 
-    def _next_round(self, rows: Rows, enough: float) -> None:
-        """y becomes a; rho grows where more than `enough` of the violation is left; gives up what cannot be held."""
-        worst, most = self.parts[rows, 2], LARGEST * self.unit
-        rho = self.penalty[rows, 0]
+    def _next_round(self, rows: Rows, grows: NDArray[np.bool_]) -> None:
+        """y becomes a, and rho grows where it should; gives up what cannot be held."""
+        worst, rho, most = self.parts[rows, 2], self.penalty[rows, 0], LARGEST * self.unit
         self.stalls[rows] += (rho >= most) & (worst > 0.5 * self.last[rows])
-        factor = np.ones(len(self.x0))
-        factor[rows] = np.where(worst > enough * self.last[rows], np.minimum(RHO_GROWTH, most / rho), 1.0)
+        self.state[rows[self.stalls[rows] >= STALLS]] = NOT_HELD
         self.last[rows] = worst
-        d = self.ddp
+        factor, d = np.ones(len(self.x0)), self.ddp
+        factor[rows] = np.where(grows, np.minimum(RHO_GROWTH, most / rho), 1.0)
         d.kernel("nocl_multipliers", rows, d.intervals, self.margin, self.c, factor, self.y, self.penalty, self.J,
                  self.parts, threads=d.threads)
-        self.state[rows[self.stalls[rows] >= STALLS]] = NOT_HELD
 
     def _cost(self) -> Array:
         return self.parts[:, 0]
@@ -127,15 +129,14 @@ class Augmented(Work):
     def _messages(self, t: Array) -> list[str]:
         message = super()._messages(t)
         over, given = self._violations()
-        for i in np.flatnonzero(given.max(axis=1, initial=0.0) > TOLERATED):
-            self.state[i] = NOT_HELD
+        for i in np.flatnonzero(self.state == OUTSIDE):
             name, where = self._worst(given[i])
-            message[i] = f"{name!r} is violated by the initial state itself, {where}: move it"
-            over[i] = 0.0
-        for i in np.flatnonzero(over.max(axis=1) > TOLD):
+            message[i] = f"infeasible: the initial state itself violates {name!r}, {where}: move it"
+        told = (over.max(axis=1) > TOLD) & (self.state != OUTSIDE) & (self.state != BLEW_UP)
+        for i in np.flatnonzero(told):
             name, where = self._worst(over[i])
             if self.state[i] in (NOT_HELD, NO_DESCENT):
-                message[i] = f"no plan holds {name!r} from here: {where}"
+                message[i] = f"infeasible: no plan holds {name!r} from here, {where}"
             else:
                 message[i] += f"; {name!r} is left, {where}"
         return message

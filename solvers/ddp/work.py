@@ -87,7 +87,8 @@ class Work:
         self.x, self.u = np.zeros((B, K + 1, nx)), np.zeros((B, K, nu))
         self.k, self.gain = np.zeros((B, K, nu)), np.zeros((B, K, nu, nx))
         self.new_x, self.new_u = np.zeros_like(self.x), np.zeros_like(self.u)
-        self.J, self.new_J = np.zeros(B), np.zeros(B)
+        self.J = np.zeros(B)
+        self.new_J = np.zeros(B)
         self.slope, self.curve, self.positive = np.zeros(B), np.zeros(B), np.zeros(B)
         self.mu, self.alpha, self.iterations = np.zeros(B), np.zeros(B), np.zeros(B, dtype=np.int64)
         self.state = np.zeros(B, dtype=np.int64)  # an index of MESSAGES
@@ -231,5 +232,6 @@ class Work:
 
 MESSAGES = ("running", "converged", "stopped at max_iterations", "no descent: the largest damping did not help",
             "the starting guess blows up: its cost is not finite",
-            "stationary, but no minimum: the cost is not convex in the controls there", "a constraint is not held")
-RUNNING, CONVERGED, OUT_OF_ITERATIONS, NO_DESCENT, BLEW_UP, NOT_CONVEX, NOT_HELD = range(7)
+            "stationary, but no minimum: the cost is not convex in the controls there", "a constraint is not held",
+            "a constraint is violated by the initial state")
+RUNNING, CONVERGED, OUT_OF_ITERATIONS, NO_DESCENT, BLEW_UP, NOT_CONVEX, NOT_HELD, OUTSIDE = range(8)
