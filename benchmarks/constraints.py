@@ -6,9 +6,9 @@ cold   24 initial states, 8 starts each (smooth random controls): the share of s
        violation at a node in units of the constraint's scale
 exact  the best of each of a few states, against IPOPT on the same nodes: the largest relative difference of cost,
        costates and gains (these at every eighth node, where the problem that begins there has neighbours at all)
-warm   400 tails, from kicked states along the solutions, with active constraints: CPU time a tail on one core; the
-       same on the system without constraints (terminal equalities as weights of its terminal cost), and, for some of the
-       same tails, fatrop from the same guesses, through CasADi's virtual machine
+warm   400 tails, from kicked states along the solutions, with active constraints: CPU time a tail on one core; then
+       on the system without constraints (terminal equalities as weights of its terminal cost), and for some of the
+       same tails fatrop from the same guesses, through CasADi's virtual machine
 
 Results go to benchmarks/results/constraints.json.
 """

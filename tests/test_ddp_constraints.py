@@ -7,7 +7,7 @@ from functools import lru_cache
 import casadi as ca
 import numpy as np
 import pytest
-from constrained import PROBLEMS, TIGHT, Problem, Shooting, kkt_residual
+from constrained import PROBLEMS, TIGHT, Problem, Shooting, kkt_residual, rk4_step
 
 import nocl
 from nocl.scales import usual_sizes
@@ -184,6 +184,36 @@ def test_units_change_nothing():
         np.testing.assert_allclose(s.cost / cost, reference.cost, rtol=1e-8)
         np.testing.assert_allclose(s.V_x / cost / unit, reference.V_x, rtol=0, atol=1e-6)
         np.testing.assert_allclose(s.gain / unit, reference.gain, rtol=0, atol=1e-3 * np.abs(reference.gain).max())
+
+
+# Between nodes
+
+
+def deepest(of: Problem, s) -> float:
+    """The largest violation of a row of x along plans whose intervals are cut in 50, in scales."""
+    h, system = s.t[:, 1] - s.t[:, 0], of.ocp.system
+    fine = ca.Function("least", [system.x, system.u], [ca.vertcat(*(c / scale for _, c, scale in of.end))])
+    step, worst = rk4_step(of.ocp), 0.0
+    for i, k in np.ndindex(s.u.shape[:2]):
+        x = s.x[i, k]
+        for _ in range(50):
+            x = step(x, s.u[i, k], h[i] / 50)[0].full().ravel()
+            worst = max(worst, -float(fine(x, s.u[i, k]).full().min()))
+    return worst
+
+
+def test_margins_hold_constraints_between_nodes():
+    of = problem("point")
+    x0 = [[-2.5, 0.2, 0.0, 0.0], [-2.2, -0.1, 0.1, 0.0]]
+    plain, held = (solver(of, 20, between=between).solve(x0) for between in (False, True))
+    assert plain.success.all()
+    assert held.success.all()
+    assert (held.message == "converged").all()
+    assert largest_violation(of, held) <= 1e-9
+    assert deepest(of, plain) > 1e-3
+    assert deepest(of, held) < 0.02 * deepest(of, plain)
+    assert (held.cost > plain.cost).all()
+    assert (held.cost < 1.05 * plain.cost).all()
 
 
 # What cannot be held

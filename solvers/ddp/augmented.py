@@ -34,6 +34,7 @@ RHO_GROWTH = 4.0
 STALLS = 2  # rounds at the largest rho in which the violation does not halve: it cannot be held
 PRICE = 100.0  # usual costs for a violation of one scale over the whole horizon, where constraints are elastic
 STIFF = 1e6  # usual costs, the weight of active rows in the sweep for gains
+KEPT = ("x", "u", "k", "gain", "J", "c", "parts", "y", "penalty", "state", "mu")  # of a plan
 
 
 @dataclass
@@ -53,6 +54,7 @@ class Augmented(Work):
         self.penalty[:, 1] = PRICE * self.unit * share / d.intervals if d.constraints == "elastic" else np.inf
         self.parts, self.new_parts = np.zeros((B, 3)), np.zeros((B, 3))  # cost, sum rho e^2 / 2, max |e|
         self.last, self.stalls = np.full(B, np.inf), np.zeros(B, dtype=np.int64)
+        self.cut = np.zeros(B, dtype=bool)  # where margins could not be held
         super().__post_init__()
         self._first_penalty()
         if d.constraints == "hard":
@@ -68,6 +70,23 @@ class Augmented(Work):
         growth = rho / self.penalty[:, 0]
         self.J[:] = self.parts[:, 0] + growth * (self.J - self.parts[:, 0])  # with y = 0 psi is proportional to rho
         self.penalty[:, 0], self.parts[:, 1] = rho, growth * self.parts[:, 1]
+
+    def exchange(self, margin: Array) -> None:
+        """Solves what converged again, held further inside by margins [B, rows]; what cannot be, stays as it was."""
+        rows = np.flatnonzero(self.state == CONVERGED)
+        kept = {name: getattr(self, name).copy() for name in KEPT}
+        spent, before = self.iterations.copy(), self.margin
+        self.margin, self.iterations[:], self.alpha[:] = margin, 0, 0.0
+        self.rollout(rows, self.x, self.u, self.gain)  # the same plan, its merit with the margins
+        self._take(rows)
+        self.state[rows], self.last[rows], self.stalls[rows], self.mu[rows] = RUNNING, np.inf, 0, 0.0
+        self.descend()
+        self.iterations += spent
+        back = rows[self.state[rows] != CONVERGED]
+        for name, value in kept.items():
+            getattr(self, name)[back] = value[back]
+        margin[back] = 0.0 if before is None else before[back]
+        self.cut[back] = True
 
     def _held_in(self) -> list[Array | None]:
         return [self.y, self.margin, self.penalty]
@@ -139,6 +158,8 @@ class Augmented(Work):
                 message[i] = f"infeasible: no plan holds {name!r} from here, {where}"
             else:
                 message[i] += f"; {name!r} is left, {where}"
+        for i in np.flatnonzero(self.cut):
+            message[i] += "; between nodes it may cut corners, margins there could not be held"
         return message
 
     def _violations(self) -> tuple[Array, Array]:

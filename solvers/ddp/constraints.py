@@ -51,7 +51,10 @@ class Block:
 
 @dataclass(frozen=True, eq=False)
 class ConstraintRows:
-    """What must hold along a plan: rows c(x, u, t, p) at every stage, c(x, p) at the end."""
+    """What must hold along a plan: rows c(x, u, t, p) at every stage, c(x, p) at the end.
+
+    The end's first rows are the stage's rows of x alone, as they stand there.
+    """
 
     stage: Block = field(default_factory=Block.none)
     end: Block = field(default_factory=Block.none)

@@ -27,6 +27,7 @@ from nocl.functions import Functions
 from nocl.ocp import OCP
 from nocl.solvers.ddp.augmented import Augmented
 from nocl.solvers.ddp.batch import Job, Piece, assembled, pieces
+from nocl.solvers.ddp.between import EXCHANGES, Dips
 from nocl.solvers.ddp.constraints import ConstraintRows, rows_of
 from nocl.solvers.ddp.kernel import ddp_source, pack_weights
 from nocl.solvers.ddp.without_compiler import ddp_kernel
@@ -60,6 +61,9 @@ class DDP:
         augmented Lagrangian; where no plan was found that holds them success is False, and the message names one.
         "elastic": the same, but a violation has a price: where holding them would cost more, they are left by as little
         as pays, and the message says so. "soft": they enter by the OCP's penalty, and nothing is held.
+    between : bool
+        Whether they hold between nodes too, all but exactly: by margins at the nodes, exchanged twice, each time for as
+        much as the plan dips between them.
     threads : int, optional
         Default: all cores.
     cache : folder for compiled kernels, optional
@@ -68,7 +72,7 @@ class DDP:
 
     def __init__(self, ocp: OCP, *, intervals: int = 80, substeps: int | None = None,
                  dynamics: LearnedDynamics | None = None, settings: DDPSettings | None = None,
-                 constraints: str = "hard", threads: int | None = None,
+                 constraints: str = "hard", between: bool = False, threads: int | None = None,
                  cache: str | os.PathLike[str] | None = None, rows: ConstraintRows | None = None) -> None:
         checks.problem(ocp, "DDP")
         for name, value in (("intervals", intervals), ("substeps", 1 if substeps is None else substeps),
@@ -79,6 +83,7 @@ class DDP:
             checks.instance(DDPSettings, settings, "settings", "DDP", "DDPSettings(max_iterations=...)")
         self.ocp, self.intervals, self.settings = ocp, int(intervals), settings or DDPSettings()
         self.constraints, self.dynamics, self.cache = constraints, dynamics, cache
+        self.between = checks.flag(between, "between", "DDP")
         self.checked = self.coarse = False  # whether the grid was held against the plant, and is too coarse for it
         self.left = substeps is None  # whether the grid was left to nocl
         self.threads = int(threads or os.cpu_count() or 1)
@@ -94,8 +99,8 @@ class DDP:
 
     def __getstate__(self) -> dict[str, Any]:
         return {"ocp": self.ocp, "intervals": self.intervals, "substeps": self.substeps, "dynamics": self.dynamics,
-                "settings": self.settings, "constraints": self.constraints, "threads": self.threads,
-                "cache": self.cache}
+                "settings": self.settings, "constraints": self.constraints, "between": self.between,
+                "threads": self.threads, "cache": self.cache}
 
     def __setstate__(self, options: dict[str, Any]) -> None:
         DDP.__init__(self, **options)  # the kernel is built, or found in the cache, where it is needed
@@ -149,7 +154,16 @@ class DDP:
         given = batch.guess.get
         work = self._work(batch.x0, batch.t0, given("u"), given("x"), given("gain"), batch.p)
         work.descend()
+        if self.between and isinstance(work, Augmented):
+            self._exchange(work)
         return work.solution(batch.curvature)
+
+    def _exchange(self, work: Augmented) -> None:
+        """Hold constraints between nodes, by margins at them."""
+        dips = Dips(_functions(self.ocp, self.dynamics), self.rows)
+        for _ in range(EXCHANGES):
+            t = work.t0[:, None] + work.h[:, None] * np.arange(self.intervals + 1)
+            work.exchange(dips.margins(t, work.x, work.u, work.p))
 
     def rollout(self, x0: Array, p: Array | None = None, **guess: Array) -> Array:
         """The states [B, K+1, nx] from x0 [B, nx] at t0 = 0 under a guess of `solve`'s: where the descent begins.
@@ -202,7 +216,7 @@ class DDP:
         net = None if self.dynamics is None else self.dynamics.net
         source = ddp_source(self.ocp, net, self.substeps, self.rows if self.held else None)
         return fingerprint(self.ocp.to_data(), source, self._weights, self.intervals, self.settings, self.constraints,
-                           version("nocl"))
+                           *([self.between] if self.between else []), version("nocl"))
 
     def _run_key(self, x0: Array, t0: Array, p: Array, guess: dict[str, Array], curvature: bool) -> str:
         """A fingerprint of all that the solution depends on."""
