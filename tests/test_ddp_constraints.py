@@ -1,5 +1,6 @@
 """Constraints in DDP: IPOPT's optimum on the same nodes, KKT conditions, analytic answers; units; no plan."""
 
+import pickle
 import re
 from dataclasses import replace
 from functools import lru_cache
@@ -292,6 +293,10 @@ def test_rows_are_the_problems_own():
     assert rows.names(3, 20)[1] == 3
     with pytest.raises(ValueError, match="a block of 1 rows has"):
         Block(ca.SX(1, 1), np.zeros(2, dtype=bool), ("a",), np.ones(1))
+    with pytest.raises(ValueError, match="cannot go to another process"):
+        pickle.dumps(solver(problem("cartpole"), 30))
+    again = pickle.loads(pickle.dumps(DDP(mass(), intervals=20, constraints="elastic", between=True)))
+    assert (again.constraints, again.between, again.held) == ("elastic", True, 21)
 
 
 @pytest.mark.parametrize("mu", [0.0, 3.0])

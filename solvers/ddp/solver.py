@@ -66,6 +66,8 @@ class DDP:
         much as the plan dips between them.
     threads : int, optional
         Default: all cores.
+    rows : ConstraintRows, optional
+        In place of the problem's own constraints.
     cache : folder for compiled kernels, optional
         Default: the folder that NOCL_CACHE names, or else one that goes with the process.
     """
@@ -91,6 +93,7 @@ class DDP:
         net = None if dynamics is None else _fitting(ocp, dynamics)
         self._weights = np.zeros(1) if net is None else pack_weights(net)
         self.substeps = int(substeps or substeps_for(ocp, dynamics, self.intervals))
+        self._own_rows = rows is not None
         given = rows_of(ocp) if rows is None else rows
         self.rows = ConstraintRows() if constraints == "soft" else given
         self.held = self.rows.count(self.intervals)  # how many rows a plan has that multipliers hold
@@ -98,6 +101,9 @@ class DDP:
         self._lb, self._ub = np.ascontiguousarray(ocp.system.lbu), np.ascontiguousarray(ocp.system.ubu)
 
     def __getstate__(self) -> dict[str, Any]:
+        if self._own_rows:
+            raise ValueError("a DDP that was given rows of its own cannot go to another process, whose symbols differ; "
+                             "expected the constraints of its problem: leave `rows` out, or use workers of this one")
         return {"ocp": self.ocp, "intervals": self.intervals, "substeps": self.substeps, "dynamics": self.dynamics,
                 "settings": self.settings, "constraints": self.constraints, "between": self.between,
                 "threads": self.threads, "cache": self.cache}
