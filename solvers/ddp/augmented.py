@@ -33,7 +33,7 @@ SHARE = 10.0  # of the guess's cost, what rho makes of its violations at first
 RHO_GROWTH = 4.0
 STALLS = 2  # rounds at the largest rho in which the violation does not halve: it cannot be held
 PRICE = 100.0  # usual costs for a violation of one scale over the whole horizon, where constraints are elastic
-STIFF = 1e6  # usual costs, the weight of active rows in the sweep for gains
+STIFF = 1e7  # usual costs, the weight of active rows in the sweep for gains
 KEPT = ("x", "u", "k", "gain", "J", "c", "parts", "y", "penalty", "state", "mu")  # of a plan
 
 

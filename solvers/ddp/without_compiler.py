@@ -189,7 +189,7 @@ class NumpyRows:
         q, least = y - rho * c, np.where(equal, -most, 0.0)
         a = np.clip(q, least, most)
         free, capped = (q > least) & (q < most), (q >= most) | (equal & (q <= least))
-        active = free & (equal | (a > 1e-15 * stiff))
+        active = free & (equal | (a > 1e-16 * stiff))
         weight = np.where(stiff > 0, np.where(active, stiff, 0.0), np.where(free, rho, 0.0))
         return q, a, np.where(capped, 1e-3 * rho, weight)
 

@@ -28,7 +28,7 @@ static lane multiplier(const lagrangian *of, lane c, lane y, int equal, lane *we
     const lane q = y - of->rho * c, most = of->largest, least = equal ? -most : (lane){0};
     const lane a = where(q < least, least, where(q > most, most, q));
     const mask low = q <= least, free = (q > least) & (q < most), capped = (q >= most) | (equal ? low : (mask){0});
-    const mask active = free & (equal ? all_lanes() : a > 1e-15 * of->stiff);
+    const mask active = free & (equal ? all_lanes() : a > 1e-16 * of->stiff);
     const lane held = where(of->stiff > 0, where(active, of->stiff, (lane){0}), where(free, of->rho, (lane){0}));
     *weight = where(capped, 1e-3 * of->rho, held);
     return a;
@@ -37,11 +37,11 @@ static lane multiplier(const lagrangian *of, lane c, lane y, int equal, lane *we
 /* Adds a row to psi, sum rho e^2 / 2 and max |e|. */
 static void add_row(lagrangian *of, lane c, lane y, int equal)
 {
-    lane weight;
-    const lane a = multiplier(of, c, y, equal, &weight), q = y - of->rho * c;
+    const lane q = y - of->rho * c, most = of->largest, least = equal ? -most : (lane){0};
+    const lane a = where(q < least, least, where(q > most, most, q)), share = 1 / of->rho;
     const mask within = q == a;
-    const lane e = where(within, c, (y - a) / of->rho), size = v_fabs(e);
-    of->psi += where(within, (0.5 * of->rho * c - y) * c, 0.5 * (a * a - y * y) / of->rho + (q - a) * a / of->rho);
+    const lane e = where(within, c, (y - a) * share), size = where(e < 0, -e, e);
+    of->psi += where(within, (0.5 * of->rho * c - y) * c, (0.5 * (a * a - y * y) + (q - a) * a) * share);
     of->square += 0.5 * of->rho * e * e;
     of->worst = where(size > of->worst, size, of->worst);
 }
