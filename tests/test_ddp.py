@@ -23,7 +23,7 @@ problem = lru_cache(nocl.load_ocp)
 
 @lru_cache
 def solver(name: str, K: int = 80) -> DDP:
-    return DDP(problem(name), intervals=K, threads=1)
+    return DDP(problem(name), intervals=K, threads=1, constraints="soft")
 
 
 @lru_cache
@@ -348,7 +348,7 @@ def test_sweep_on_networks_equals_casadis_derivatives_of_the_step(name, activati
     ocp, model, K, B = problem(name), random_model(name, activations), 6, 9
     s, n = ocp.system, ocp.system.nx
     u = np.random.default_rng(1).uniform(0.5 * s.lbu, 0.5 * s.ubu, (B, K, s.nu))
-    d = DDP(ocp, intervals=K, substeps=1, dynamics=model, threads=1)
+    d = DDP(ocp, intervals=K, substeps=1, dynamics=model, constraints="soft", threads=1)
     work = Work(d, ocp.initial_states.sample(B, 0), np.zeros(B), u, None, None)
     V, V_x, V_xx = np.zeros((B, K + 1)), np.zeros((B, K + 1, n)), np.zeros((B, K + 1, n, n))
     work.backward(np.arange(B), V, V_x, V_xx)

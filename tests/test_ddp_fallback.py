@@ -16,7 +16,7 @@ FIELDS = ("cost", "x", "u", "gain", "V", "V_x", "V_xx", "success", "message", "i
 
 def both(name, K, n, dynamics=None, **guess):
     ocp = nocl.load_ocp(name)
-    compiled, slow = (DDP(ocp, intervals=K, dynamics=dynamics, threads=1) for _ in range(2))
+    compiled, slow = (DDP(ocp, intervals=K, dynamics=dynamics, constraints="soft", threads=1) for _ in range(2))
     slow.kernel = NumpyKernel(ocp, dynamics)
     x0, t0 = ocp.initial_states.sample(n, 3), np.linspace(0, ocp.horizon / 2, n)
     return [d.solve(x0, t0, curvature=True, **guess) for d in (compiled, slow)]
@@ -46,7 +46,7 @@ def test_one_sweep_and_one_rollout_equal_the_compiled_ones(name, mu):
     u[:, ::3] = np.where(rng.random((B, len(u[0, ::3]), s.nu)) < 0.5, s.lbu, s.ubu)  # controls at their limits
     results = []
     for slow in (False, True):
-        d = DDP(ocp, intervals=K, substeps=1, threads=1)
+        d = DDP(ocp, intervals=K, substeps=1, constraints="soft", threads=1)
         if slow:
             d.kernel = NumpyKernel(ocp)
         work = Work(d, ocp.initial_states.sample(B, 0), np.zeros(B), u, None, None)

@@ -23,6 +23,7 @@ class Descent(Protocol):
 
     ocp: OCP
     intervals: int
+    held: int
 
     def descend(self, batch: Piece) -> Solution: ...
 
@@ -80,7 +81,7 @@ class Job:
 def bytes_each(ddp: Descent, curvature: bool) -> int:
     """What one problem takes while it is solved."""
     K, nx, nu = ddp.intervals, ddp.ocp.system.nx, ddp.ocp.system.nu
-    return 8 * (K + 1) * (4 * nx + 4 * nu + 2 * nu * nx + 3 + (nx * nx if curvature else 0))
+    return 8 * (K + 1) * (4 * nx + 4 * nu + 2 * nu * nx + 3 + (nx * nx if curvature else 0)) + 8 * 6 * ddp.held
 
 
 def pieces(ddp: Descent, x0: Array, t0: Array, guess: dict[str, Array], curvature: bool,

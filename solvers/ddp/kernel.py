@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from nocl.functions import Stage
 from nocl.ocp import OCP
 from nocl.scales import units
+from nocl.solvers.ddp.constraints import ConstraintRows, rows_source
 from nocl.support.checks import Array
 from nocl.translate.kernels import emit
 
@@ -36,13 +37,14 @@ def pack_weights(net: Any) -> Array:
     return np.concatenate([np.zeros(1), *(p.detach().double().cpu().numpy().ravel() for p in parts)])
 
 
-def ddp_source(ocp: OCP, net: Any = None, substeps: int = 1) -> str:
+def ddp_source(ocp: OCP, net: Any = None, substeps: int = 1, rows: ConstraintRows | None = None) -> str:
     """The generated part of the kernel: what csrc/ddp.h lists, for the exact f or for f_theta's FeatureNet.
 
     substeps : Runge-Kutta steps in each interval
+    rows : constraints that are held by multipliers; None: they enter by the OCP's penalty
     """
     at = ocp.functions.stage
-    stage, inputs = _Derivatives(at, net), stage_inputs(at)
+    stage, inputs = _Derivatives(at, net, soft=rows is None), stage_inputs(at)
     nets, networks, n, m = stage.nets, stage.networks, ocp.system.nx, ocp.system.nu
     sizes = {"N": n, "M": m, "NET": networks.numel(), "TAPE": sum(n.tape for n in nets),
              "NV": stage.v.numel(), "BEND": stage.bend.numel(), "NJ": stage.J.nnz(), "NW": stage.W.nnz(),
@@ -61,7 +63,8 @@ def ddp_source(ocp: OCP, net: Any = None, substeps: int = 1) -> str:
              _chain(n, m, stage.J.sparsity(), stage.W.sparsity())]
     if ocp.np:
         lines.append(emit("stage_parameters", [*moment, networks, stage.bend, stage.mu], [stage.by_p]))
-    lines += [*_terminal(ocp, inputs), '#include "ddp.h"\n']
+    held = [] if rows is None else rows_source(ocp, rows, inputs)
+    lines += [*_terminal(ocp, inputs), *held, '#include "ddp.h"\n']
     return "\n".join(lines)
 
 
@@ -126,7 +129,7 @@ class _Derivatives:
     """(xdot, L) at a stage, its Jacobian, the weighted Hessian's lower triangle and gradient by p; networks as symbols.
     """
 
-    def __init__(self, at: Stage, net: Any) -> None:
+    def __init__(self, at: Stage, net: Any, soft: bool) -> None:
         z, self.mu = at.z, ca.SX.sym("mu", at.x.numel() + 1)
         p = at["p"] if "p" in at.names else ca.SX(0, 1)
         given = [] if net is None else at.of_system[:net.inputs.n_in()]
@@ -136,7 +139,7 @@ class _Derivatives:
         self.networks = ca.vertcat(*(ca.vec(n.symbols) for n in self.nets))
         self.bend = ca.vertcat(*(n.bend for n in self.nets))
         xdot = at.xdot if net is None else net.outputs(*given, *(n.y for n in self.nets))
-        self.rhs = ca.vertcat(xdot, at.L_soft)
+        self.rhs = ca.vertcat(xdot, at.L_soft if soft else at.L)
         y, yz = ca.vertcat(*(n.y for n in self.nets)), ca.vertcat(*(n.slopes for n in self.nets))
         self.J, scalar = ca.jacobian(self.rhs, z), ca.dot(self.mu, self.rhs)
         H, self.v = ca.hessian(scalar, z)[0], ca.SX(0, 1)

@@ -24,6 +24,10 @@
 
    The kernels take d_ [B, ND] behind h_, t at the start of each problem, and nocl_backward one more result, V_p [B, NP].
 
+   A problem with constraints has what rows.h lists. Its kernels take y [B, ROWS], margin [B, ROWS] or NULL and penalty [B, 3] behind
+   all else, nocl_rollout also c [B, ROWS] and parts [B, 3] = (cost, sum rho e^2 / 2, max |e|), and its J is the merit, cost + psi.
+   Where mu > 0 its sweeps leave out the second derivatives of f and of the rows (Gauss-Newton).
+
    Arrays are problem-major, rows as numpy has them: x [B, K+1, N], u [B, K, M], gains [B, K, M, N]. */
 #ifdef ND
 #define DATA_IN const lane *d,
@@ -55,6 +59,21 @@ static void later(const lane *d, lane time, lane *now)
 #define BY_P
 #endif
 
+#ifdef NC
+#include "rows.h"
+#define ROWS_IN , const double *y_, const double *margin_, const double *penalty_
+#define ROWS_OUT , double *c_, double *parts_
+#define BENT_IN , lane bent
+#define BENT , bent
+#define ALONG(from, lam) lane lam[N]; for (int i = 0; i < N; ++i) lam[i] = bent * from[i];
+#else
+#define ROWS_IN
+#define ROWS_OUT
+#define BENT_IN
+#define BENT
+#define ALONG(from, lam) const lane *lam = from;
+#endif
+
 /* One Runge-Kutta step, x to next; returns its cost. */
 static lane step(const double *weights, const lane *x, const lane *u, DATA_IN lane h, lane *next)
 {
@@ -75,13 +94,16 @@ static lane step(const double *weights, const lane *x, const lane *u, DATA_IN la
 void nocl_rollout(int64_t first, int64_t last, const int64_t *index, int64_t K, const double *weights,
                   const double *lb, const double *ub, const double *h_, DATA_ARRAY const double *x0, const double *x_bar,
                   const double *u_bar, const double *k, const double *gain, const double *alpha,
-                  double *x_, double *u_, double *J)
+                  double *x_, double *u_, double *J ROWS_IN ROWS_OUT)
 {
     for (int64_t b = first; b < last; ++b) {
         const int64_t *at = index + b * WIDTH;
         lane x[N], u[M], next[N], G[1], Gx[N], Gxx[N * N], cost = {0};
         const lane h = gather(h_, at, 1, 0), a = gather(alpha, at, 1, 0);
         GATHER_DATA
+#ifdef NC
+        lagrangian rows = lagrangian_of(penalty_, at);
+#endif
         for (int i = 0; i < N; ++i) x[i] = gather(x0, at, N, i);
         for (int64_t t = 0; t < K; ++t) {
             lane dx[N];
@@ -95,6 +117,15 @@ void nocl_rollout(int64_t first, int64_t last, const int64_t *index, int64_t K, 
                 u[j] = where(u[j] < splat(lb[j]), splat(lb[j]), where(u[j] > splat(ub[j]), splat(ub[j]), u[j]));
                 scatter(u_, at, K * M, t * M + j, u[j]);
             }
+#ifdef NC
+            {
+                lane c[NC + 1];
+                LATER(begin, (double)t * h, now)
+                stage_rows(x, u, NOW c);
+                scatter_rows(c_, c, NC, at, ROWS, t * NC);
+                add_rows(&rows, c, y_, margin_, at, K, t);
+            }
+#endif
             for (int part = 0; part < SUBSTEPS; ++part) {
                 LATER(begin, (t + part / (double)SUBSTEPS) * h, now)
                 cost += step(weights, x, u, NOW h / SUBSTEPS, next);
@@ -103,6 +134,16 @@ void nocl_rollout(int64_t first, int64_t last, const int64_t *index, int64_t K, 
         }
         for (int i = 0; i < N; ++i) scatter(x_, at, (K + 1) * N, K * N + i, x[i]);
         terminal(x, BEGIN G, Gx, Gxx);
+#ifdef NC
+        lane c[NT + 1];
+        end_rows(x, BEGIN c);
+        scatter_rows(c_, c, NT, at, ROWS, K * NC);
+        add_rows(&rows, c, y_, margin_, at, K, K);
+        scatter(parts_, at, 3, 0, cost + G[0]);
+        scatter(parts_, at, 3, 1, rows.square);
+        scatter(parts_, at, 3, 2, rows.worst);
+        cost += rows.psi;
+#endif
         scatter(J, at, 1, 0, cost + G[0]);
     }
 }
@@ -301,7 +342,7 @@ static void earlier(const lane *F, const lane *l, const lane *H, lane Q[NZ][NZ],
 
 /* Q and q of an interval from V at its end; returns its cost. Adds to dV/dp where it is asked for. */
 static lane interval(const double *weights, const lane *x, const lane *u, DATA_IN lane h, const lane *Vx, const lane *Vxx,
-                     lane Q[NZ][NZ], lane *q BY_P_IN)
+                     lane Q[NZ][NZ], lane *q BENT_IN BY_P_IN)
 {
     lane s[SUBSTEPS][N], F[N * NZ], l[NZ], H[NZ * NZ], cost;
     for (int i = 0; i < N; ++i) s[0][i] = x[i];
@@ -310,11 +351,13 @@ static lane interval(const double *weights, const lane *x, const lane *u, DATA_I
         step(weights, s[part - 1], u, NOW h / SUBSTEPS, s[part]);
     }
     LATER(d, (SUBSTEPS - 1) * h / SUBSTEPS, now)
-    cost = derivatives(weights, s[SUBSTEPS - 1], u, NOW Vx, h / SUBSTEPS, F, l, H BY_P);
+    ALONG(Vx, lam)
+    cost = derivatives(weights, s[SUBSTEPS - 1], u, NOW lam, h / SUBSTEPS, F, l, H BY_P);
     action_value(F, l, H, Vx, Vxx, Q, q);
     for (int part = SUBSTEPS - 2; part >= 0; --part) {
         LATER(d, part * h / SUBSTEPS, now)
-        cost += derivatives(weights, s[part], u, NOW q, h / SUBSTEPS, F, l, H BY_P);
+        ALONG(q, lam)
+        cost += derivatives(weights, s[part], u, NOW lam, h / SUBSTEPS, F, l, H BY_P);
         earlier(F, l, H, Q, q);
     }
     return cost;
@@ -343,13 +386,55 @@ static void value_update(lane Q[NZ][NZ], const lane *q, const lane *k, lane gain
     }
 }
 
+#ifdef NC
+/* Adds a stage's rows to Q and q, and to dV/dp where it is asked for. */
+static void stage_held(const lagrangian *of, const lane *x, const lane *u, DATA_IN const double *y_, const double *margin_,
+                       const int64_t *at, int64_t K, int64_t t, lane Q[NZ][NZ], lane *q BENT_IN BY_P_IN)
+{
+    lane c[NC + 1], a[NC + 1], w[NC + 1], second[NC + 1], g[NZ], W[NZ * NZ];
+    stage_rows(x, u, DATA c);
+    weigh_rows(of, c, bent, y_, margin_, at, K, t, a, w, second);
+    stage_rows_model(x, u, DATA a, w, second, g, W);
+    for (int i = 0; i < NZ; ++i) {
+        q[i] += g[i];
+        for (int j = 0; j < NZ; ++j) Q[i][j] += W[i * NZ + j];
+    }
+#if defined(ND) && NP > 0
+    if (by_p) {
+        lane part[NP];
+        stage_rows_parameters(x, u, d, a, part);
+        for (int i = 0; i < NP; ++i) by_p[i] += part[i];
+    }
+#endif
+}
+
+/* Adds the rows of the end to V_x and V_xx, and to dV/dp where it is asked for. */
+static void end_held(const lagrangian *of, const lane *x, DATA_IN const double *y_, const double *margin_, const int64_t *at,
+                     int64_t K, lane *Vx, lane *Vxx BENT_IN BY_P_IN)
+{
+    lane c[NT + 1], a[NT + 1], w[NT + 1], second[NT + 1], g[N], W[N * N];
+    end_rows(x, DATA c);
+    weigh_rows(of, c, bent, y_, margin_, at, K, K, a, w, second);
+    end_rows_model(x, DATA a, w, second, g, W);
+    for (int i = 0; i < N; ++i) Vx[i] += g[i];
+    for (int i = 0; i < N * N; ++i) Vxx[i] += W[i];
+#if defined(ND) && NP > 0
+    if (by_p) {
+        lane part[NP];
+        end_rows_parameters(x, d, a, part);
+        for (int i = 0; i < NP; ++i) by_p[i] += part[i];
+    }
+#endif
+}
+#endif
+
 /* The Riccati sweep about (x, u). Writes k, gain, slope = sum k'q, curve = sum k'Q k / 2, whether every Quu + mu D was
    positive, and, where asked for (not NULL), V [B, K+1], V_x [B, K+1, N], V_xx [B, K+1, N, N]; with parameters V_p [B, NP],
    the gradient of the trajectory's cost, which is that of the optimum's. */
 void nocl_backward(int64_t first, int64_t last, const int64_t *index, int64_t K, const double *weights,
                    const double *lb, const double *ub, const double *h_, DATA_ARRAY const double *x_, const double *u_,
                    const double *mu_, double *k_, double *gain_, double *slope_, double *curve_, double *positive_,
-                   double *V_, double *Vx_, double *Vxx_ BY_P_ARRAY)
+                   double *V_, double *Vx_, double *Vxx_ BY_P_ARRAY ROWS_IN)
 {
     for (int64_t b = first; b < last; ++b) {
         const int64_t *at = index + b * WIDTH;
@@ -365,6 +450,11 @@ void nocl_backward(int64_t first, int64_t last, const int64_t *index, int64_t K,
         if (by_p) terminal_parameters(x, begin, by_p);
 #endif
 #endif
+#ifdef NC
+        const lagrangian rows = lagrangian_of(penalty_, at);
+        const lane bent = truth(reg == 0);
+        end_held(&rows, x, BEGIN y_, margin_, at, K, Vx, Vxx BENT BY_P);
+#endif
         for (int64_t t = K;; --t) {
             if (V_) scatter(V_, at, K + 1, t, V[0]);
             if (Vx_) for (int i = 0; i < N; ++i) scatter(Vx_, at, (K + 1) * N, t * N + i, Vx[i]);
@@ -375,7 +465,10 @@ void nocl_backward(int64_t first, int64_t last, const int64_t *index, int64_t K,
             for (int i = 0; i < N; ++i) x[i] = gather(x_, at, (K + 1) * N, (t - 1) * N + i);
             for (int j = 0; j < M; ++j) u[j] = gather(u_, at, K * M, (t - 1) * M + j);
             LATER(begin, (double)(t - 1) * h, now)
-            V[0] += interval(weights, x, u, NOW h, Vx, Vxx, Q, q BY_P);
+            V[0] += interval(weights, x, u, NOW h, Vx, Vxx, Q, q BENT BY_P);
+#ifdef NC
+            stage_held(&rows, x, u, NOW y_, margin_, at, K, t - 1, Q, q BENT BY_P);
+#endif
             for (int i = 0; i < M; ++i)
                 for (int j = 0; j < M; ++j) Quu[i][j] = Q[N + i][N + j] + (i == j ? reg * DAMPED[i] : (lane){0});
             positive &= boxed_newton(Quu, q + N, u, lb, ub, held, k, L);
