@@ -12,6 +12,7 @@ from constrained import PROBLEMS, TIGHT, Problem, Shooting, kkt_residual, rk4_st
 
 import nocl
 from nocl.scales import usual_sizes
+from nocl.solvers import NMPC
 from nocl.solvers.ddp import augmented
 from nocl.solvers.ddp.constraints import Block, ConstraintRows, rows_of
 from nocl.solvers.ddp.kernel import ddp_source
@@ -339,3 +340,25 @@ def test_problems_without_constraints_have_the_kernel_they_had():
     assert "#define NC" not in ddp_source(free)
     assert "#define NC" not in ddp_source(ocp)  # as training has it: softly
     assert "#define NC 1\n#define NT 1\n" in ddp_source(ocp, rows=rows_of(ocp))
+
+
+def test_every_kind_of_constraint_as_nmpc_holds_it():
+    """Two-sided, of the control, a state's bound, in time, with a parameter, and equations at the end."""
+    p, v, u, wall = ca.SX.sym("p"), ca.SX.sym("v"), ca.SX.sym("u"), nocl.parameter("wall", 1.3)
+    cart = nocl.System("cart", x=ca.vertcat(p, v), u=u, xdot=ca.vertcat(v, u - 0.1 * v), lbu=[-3], ubu=[3],
+                       lbx=[-5, -5], ubx=[5, 5])
+    ocp = nocl.OCP(cart, p=wall, horizon=2.0, running=0.1 * u**2 + 0.01 * p**2, terminal=0.0, x_goal=[0, 0], u_goal=[0],
+                   initial_states=nocl.Uniform([0.6, -0.1], [1.0, 0.1]), parameters=nocl.Uniform([1.2], [1.6]),
+                   constraints={"track": (-0.05, p, None), "wall": wall - p, "power": (None, u * v, 0.8),
+                                "slower": 1.2 - 0.2 * nocl.time() + v},
+                   state_bounds={"v": (-0.75, None)}, terminal_constraints={"at rest": (0, v, 0), "there": (0, p, 0)})
+    x0, at = np.array([[1.0, 0.0], [0.8, 0.1], [0.7, -0.1]]), np.array([[1.3], [1.2], [1.5]])
+    ddp = DDP(ocp, intervals=40, substeps=1).solve(x0, p=at)
+    nmpc = NMPC(ocp, 40, substeps=1, starts=1, passes=0).solve(x0, p=at, workers=1)
+    assert ddp.success.all()
+    assert nmpc.success.all()
+    np.testing.assert_allclose(ddp.cost, nmpc.cost, rtol=1e-7)
+    np.testing.assert_allclose(ddp.x, nmpc.x, atol=1e-5)
+    np.testing.assert_allclose(ddp.V_x[:, 0], nmpc.costate[:, 0], rtol=1e-4, atol=1e-5)
+    assert np.abs(ddp.x[:, -1]).max() < 1e-8
+    assert (ddp.x[:, :, 1].min(axis=1) < -0.75 + 1e-6).any()  # it is active

@@ -81,9 +81,9 @@ class DDP:
                             ("threads", 1 if threads is None else threads)):
             checks.whole(value, name, "DDP", 1)
         checks.word(constraints, ("hard", "elastic", "soft"), "constraints", "DDP")
-        ocp.refuse_free("DDP")
         if constraints == "soft":
-            ocp.refuse_constraints("DDP(constraints='soft')", "take constraints='hard'")
+            ocp.refuse_constraints("DDP with constraints='soft'", "take constraints='hard', or solve it by NMPC")
+        ocp.refuse_free("DDP")
         if settings is not None:
             checks.instance(DDPSettings, settings, "settings", "DDP", "DDPSettings(max_iterations=...)")
         self.ocp, self.intervals, self.settings = ocp, int(intervals), settings or DDPSettings()
