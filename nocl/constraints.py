@@ -160,7 +160,7 @@ class Rows:
         return len(self.of)
 
     def __getitem__(self, some: slice) -> Rows:
-        return Rows(self.column[some], self.of[some], self.sides[some], self.of_u[some])
+        return Rows(self.column[some, :], self.of[some], self.sides[some], self.of_u[some])
 
     @property
     def names(self) -> tuple[str, ...]:

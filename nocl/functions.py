@@ -94,7 +94,7 @@ class Functions:
     @cached_property
     def constraints(self) -> ca.SX:
         """h(x), a column, in the users' own units."""
-        return self.rows.column[:self.rows.n_h]
+        return self.rows.column[:self.rows.n_h, :]
 
     @cached_property
     def penalised(self) -> list[ca.SX]:
@@ -181,12 +181,12 @@ class Functions:
     def c_of_x(self) -> ca.Function:
         """(x[, t][, p]) -> the rows of these alone, in their own units: h, then equations."""
         n = self.rows.n_x
-        return self.h if n == self.rows.n_h else self.node.function("c_of_x", {"c": self.rows.column[:n]})
+        return self.h if n == self.rows.n_h else self.node.function("c_of_x", {"c": self.rows.column[:n, :]})
 
     @cached_property
     def c_of_u(self) -> ca.Function:
         """(x, u[, t][, p]) -> the rows that hold the control, in their own units."""
-        return self.arguments.function("c_of_u", {"c": self.rows.column[self.rows.n_x:]})
+        return self.arguments.function("c_of_u", {"c": self.rows.column[self.rows.n_x:, :]})
 
     @cached_property
     def c_at_end(self) -> ca.Function:

@@ -322,3 +322,13 @@ def test_ddp_tells_whose_row_it_could_not_hold():
     s = DDP(make(constraints={"track": (-2, P, 1.1)}, running=0.1 * U**2), intervals=40).solve([[1.0, 1.5], [1.0, 0.0]])
     assert s.success.tolist() == [False, True]
     assert "no plan holds 'track' from here" in s.message[0]
+
+
+@pytest.mark.parametrize("kind", BEYOND)
+def test_what_is_not_there_has_no_rows(kind):
+    of = make(**BEYOND[kind]).functions
+    assert of.h.size_out(0) == (0, 1)
+    assert of.c.size_out(0) == (len(of.rows), 1)
+    assert of.c_end.size_out(0) == (len(of.end_rows), 1)
+    assert of.c_of_x.size_out(0) == (of.rows.n_x, 1)
+    assert of.c_of_u.size_out(0) == (len(of.rows) - of.rows.n_x, 1)

@@ -379,6 +379,17 @@ def test_each_row_is_scaled_by_its_own_size(kind):
     assert a.costate[0] * [1e6, 1] == pytest.approx(b.costate[0], abs=1e-4)
 
 
+def test_one_state_is_enough():
+    """v' = u in least time: from 1 to 0 under |u| <= 1 it takes 1, under u >= -.8 by a constraint 1.25."""
+    one = nocl.System("one", x=V, u=U, xdot=U, lbu=[-1], ubu=[1], lbx=[-2], ubx=[2])
+    ocp = nocl.OCP(one, horizon=nocl.Free(0.1, 5), running=1.0, terminal=0.0, x_goal=[0], u_goal=[0],
+                   initial_states=nocl.Uniform([0.5], [1]), terminal_constraints={"end": (0, V, 0)})
+    assert solver(ocp, 4).solve([1.0], **SERIAL).cost[0] == pytest.approx(1, rel=1e-7)
+    slow = replace(ocp, constraints={"slow": U + 0.8})
+    assert solver(slow, 4).solve([1.0], **SERIAL).cost[0] == pytest.approx(1.25, rel=1e-7)
+    assert solver(slow, 4, soft=["end"]).solve([1.0], **SERIAL).cost[0] == pytest.approx(1.25, rel=1e-7)
+
+
 NUMBERS = st.floats(-1, 1)
 
 

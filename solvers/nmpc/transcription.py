@@ -229,9 +229,9 @@ class Transcription:
         s, N = self.ocp.system, self.N
         n, nu = s.nx + self.free, s.nu
         size = n + nu + self.held.slacks
-        inner, last = ca.reshape(w[: size * N], size, N), w[size * N:]
-        return (ca.horzcat(inner[:n, :], last[:n]), inner[n: n + nu, :],
-                ca.horzcat(inner[n + nu:, :], last[n:]))
+        inner, last = ca.reshape(w[: size * N, :], size, N), w[size * N:, :]
+        return (ca.horzcat(inner[:n, :], last[:n, :]), inner[n: n + nu, :],
+                ca.horzcat(inner[n + nu:, :], last[n:, :]))
 
     @cached_property
     def solver(self) -> ca.Function:
