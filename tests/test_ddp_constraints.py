@@ -139,7 +139,7 @@ def random_half_planes() -> Problem:
                          xdot=ca.vertcat(x[2:], u), lbu=[-3, -3], ubu=[3, 3], lbx=[-3] * 4, ubx=[3] * 4)
     ocp = nocl.OCP(system, horizon=2.0, running=0.1 * ca.sumsqr(u) + ca.sumsqr(x[:2]), terminal=ca.sumsqr(x), p=p,
                    x_goal=[0] * 4, u_goal=[0, 0], initial_states=nocl.Uniform([-1] * 4, [1] * 4),
-                   parameters=nocl.Uniform([-1, -1, -0.2], [1, 1, 2.2]))
+                   parameters=nocl.Uniform([-1, -1, -2.1], [1, 1, 2.1]))
     rows = [("plane", p[0] * x[0] + p[1] * x[1] + p[2], 1.0)]
     return Problem(ocp, rows, rows)
 
@@ -149,7 +149,7 @@ def test_random_constraints_satisfy_kkt_and_their_slopes():
     ocp, ddp = of.ocp, solver(of, 15)
     p, x0 = ocp.parameters.sample(n, 0), ocp.initial_states.sample(n, 0)
     x0[:, 2:] = 0
-    p[:, 2] = np.maximum(p[:, 2] / 10, 0.05 - (p[:, :2] * x0[:, :2]).sum(axis=1))  # x0 holds it
+    p[:, 2] = 0.05 - (p[:, :2] * x0[:, :2]).sum(axis=1)  # x0 holds it, the origin often not
     s = ddp.solve(x0, p=p)
     assert s.success.all()
     assert max(kkt_residual(of, s, i, p[i]) for i in range(n)) < 1e-7
