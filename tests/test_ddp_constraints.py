@@ -353,7 +353,7 @@ def test_every_kind_of_constraint_as_nmpc_holds_it():
                                 "slower": 1.2 - 0.2 * nocl.time() + v},
                    state_bounds={"v": (-0.72, None)}, terminal_constraints={"at rest": (0, v, 0), "there": (0, p, 0)})
     x0, at = np.array([[1.0, 0.0], [0.8, 0.1], [0.7, -0.1]]), np.array([[1.3], [1.2], [1.5]])
-    ddp = DDP(ocp, intervals=40, substeps=1).solve(x0, p=at)
+    ddp = DDP(ocp, intervals=40).solve(x0, p=at)
     nmpc = NMPC(ocp, 40, substeps=1, starts=1, passes=0).solve(x0, p=at, workers=1)
     assert ddp.success.all()
     assert nmpc.success.all()

@@ -246,12 +246,13 @@ class DDP:
 @lru_cache(maxsize=32)
 def substeps_for(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int, tolerance: float = COARSE) -> int:
     """As many as solutions from a few initial states ask for, so that they are off by `tolerance` at most."""
-    functions, (x0, p) = _functions(ocp, dynamics), firsts(ocp)
+    tried = ocp if ocp.states_only else ocp.unconstrained  # a few descents, to see how fast the plant is
+    functions, (x0, p) = _functions(tried, dynamics), firsts(ocp)
 
     def ask(substeps: int) -> Grid | None:
-        ddp = DDP(ocp, intervals=intervals, substeps=substeps, dynamics=dynamics, constraints="soft")
+        ddp = DDP(tried, intervals=intervals, substeps=substeps, dynamics=dynamics, constraints="soft")
         ddp.checked = True
-        return measured(ocp, functions, ddp.solve(x0, p=p, progress=False), substeps)
+        return measured(tried, functions, ddp.solve(x0, p=p, progress=False), substeps)
 
     return settled(f"DDP of {ocp.system.name}", ask, ocp.horizon / intervals, lambda: fastest_at_start(ocp, functions),
                    tolerance)
