@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike
 from nocl.ocp import OCP
 from nocl.support import checks
 from nocl.support.checks import Array
+from nocl.translate.arguments import Arguments
 from nocl.translate.rk4 import rk4_cost
 
 NOISE = 1e-3  # of half the width of X: what a measured state is off by, unless said otherwise
@@ -102,16 +103,14 @@ class ParameterEstimator:
 def _prediction(ocp: OCP, dt: float, substeps: int) -> ca.Function:
     """(x, u, t, p of the system) -> (the state after dt, its derivatives by p), as one column."""
     s = ocp.system
-    x, u, t, p = ca.SX.sym("x", s.nx), ca.SX.sym("u", s.nu), ca.SX.sym("t"), ca.SX.sym("p", s.np)
-    known = {"x": x, "u": u, "t": t, "p": p}
+    at = Arguments.new(ca.SX, x=s.nx, u=s.nu, t=1, p=s.np)
+    every = ca.vertcat(at["p"], ca.DM(ocp.nominal[s.np:]))  # f holds none of the problem's own
 
     def f(x: Any, u: Any, t: Any) -> Any:
-        at = {**known, "x": x, "u": u, "t": t}
-        return s.f(*(at[name] for name in s.arguments.names))
+        return at.given(x=x, u=u, t=t, p=every).call(ocp.functions.f)
 
-    end, _ = rk4_cost(f, lambda *_: 0, x, u, dt, substeps, t)
-    column = ca.vertcat(end, ca.vec(ca.densify(ca.jacobian(end, p))))
-    return ca.Function("prediction", [x, u, t, p], [column])
+    end, _ = rk4_cost(f, lambda *_: 0, at["x"], at["u"], dt, substeps, at["t"])
+    return at.function("prediction", {"column": ca.vertcat(end, ca.vec(ca.densify(ca.jacobian(end, at["p"]))))})
 
 
 class Adaptive:
