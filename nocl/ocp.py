@@ -405,7 +405,7 @@ class OCP:
         """Whether all constraints are inequalities of (x, t, p) along the trajectory: those that `h` has."""
         return len(self.functions.rows) == self.functions.rows.n_h and not self.held_at_end
 
-    def refuse_constraints(self, owner: str, remedy: str = "solve it by NMPC") -> None:
+    def refuse_constraints(self, owner: str, remedy: str = "solve it by NMPC or DDP") -> None:
         """ValueError for constraints that hold a control, equations, terminal constraints and a free horizon: for what
         has no use of them, or not yet.
         """

@@ -51,22 +51,18 @@ class ParameterEstimator:
     noise : [nx], optional
         Standard deviation of what a measured state, or the model's step, is off by. Default: 1e-3 of half the width
         of X.
-    drift : float
-        How far parameters may move in a unit of time, as a share of half the width of their box. 0: constant ones.
     substeps : int
         RK4 steps of a prediction.
 
     Raises ValueError for systems without parameters.
     """
 
-    def __init__(self, ocp: OCP, dt: float, *, noise: ArrayLike | None = None, drift: float = 0.0,
-                 substeps: int = 4) -> None:
+    def __init__(self, ocp: OCP, dt: float, *, noise: ArrayLike | None = None, substeps: int = 4) -> None:
         checks.problem(ocp, "ParameterEstimator")
         s, owner = ocp.system, "ParameterEstimator"
         if not s.np:
             raise ValueError(f"{owner}: {s.name!r} has no parameters; expected a system with some: System(..., p=mass)")
         self.ocp, self.dt = ocp, checks.number(dt, "dt", owner, positive=True)
-        self.drift = checks.between(drift, 0.0, np.inf, "drift", owner)
         off = NOISE * (s.ubx - s.lbx) / 2 if noise is None else checks.vector(noise, s.nx, "noise", owner)
         if not (off > 0).all():
             raise ValueError(f"{owner}: noise is {checks.shown(noise)}; expected numbers > 0, one for each state")
@@ -87,11 +83,11 @@ class ParameterEstimator:
         expected, H = predicted[:nx].T, predicted[nx:].T.reshape(-1, q, nx).transpose(0, 2, 1)
         share = np.where(self.half > 0, self.half, 1.0)  # no width: known for certain, its variance is 0
         H, e = H / self.noise[:, None] * share, (after - expected) / self.noise  # in units of noise and of the box
-        P = estimate.covariance / np.outer(share, share) + self.drift**2 * self.dt * np.eye(q)
-        innovation = H @ P @ H.transpose(0, 2, 1) + np.eye(nx)
-        size = np.einsum("bi,bi->b", e, np.linalg.solve(innovation, e[..., None])[..., 0]) / nx
+        P = estimate.covariance / np.outer(share, share)
+        spread = H @ P @ H.transpose(0, 2, 1)  # of what is expected, by what is not known of p
+        size = np.einsum("bi,bi->b", e, np.linalg.solve(spread + np.eye(nx), e[..., None])[..., 0]) / nx
         doubt = np.maximum(size / OUTLIER**2, 1.0)[:, None, None]  # of the measurement: Huber's weight, inverted
-        gain = np.linalg.solve(H @ P @ H.transpose(0, 2, 1) + doubt * np.eye(nx), H @ P).transpose(0, 2, 1)
+        gain = np.linalg.solve(spread + doubt * np.eye(nx), H @ P).transpose(0, 2, 1)
         keep = np.eye(q) - gain @ H
         P = keep @ P @ keep.transpose(0, 2, 1) + doubt * gain @ gain.transpose(0, 2, 1)  # Joseph's form
         moved = estimate.p + share * (gain @ e[..., None])[..., 0]

@@ -138,7 +138,6 @@ def test_what_is_refused():
             (lambda: ParameterEstimator(ocp, 0.0), "dt is 0"),
             (lambda: ParameterEstimator(ocp, DT, noise=[1.0, 0.0]), "noise is"),
             (lambda: ParameterEstimator(ocp, DT, noise=[1.0]), "noise"),
-            (lambda: ParameterEstimator(ocp, DT, drift=-1.0), "drift is -1"),
             (lambda: ParameterEstimator(ocp, DT, substeps=0), "substeps is 0"),
             (lambda: Adaptive(3, filter_), "law is a int"),
             (lambda: Adaptive(lambda x, t, p: x, 3), "estimator"),

@@ -107,7 +107,8 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
         return CND(ocp, policy, value, card)
     ocp.check_strict("train")
     own = own_features(ocp, features)
-    chosen = _expect(settings or TrainSettings.of("normal", parameters=ocp.np), TrainSettings)
+    usual = TrainSettings.of("normal", parameters=ocp.np)
+    chosen = usual if settings is None else _expect(settings, TrainSettings)
     return Training(ocp, dynamics, chosen, seed, out, progress, own).run()
 
 
