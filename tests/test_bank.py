@@ -178,6 +178,29 @@ def test_extend_is_the_best_descent_from_its_neighbours():
         extend(cartpole(), bank(), near, neighbours=0)
 
 
+def test_of_many_neighbours_those_are_followed_that_are_cheapest_after_one_iteration():
+    x0, b = states()[:10] + 0.1, bank()
+    rows = b.nearest(x0, count=6)
+    first = np.array([cartpole().attempt(x0, **b.guess(column, 0.0, x0))[0] for column in rows.T])
+    each = np.array([cartpole().solve(x0, **b.guess(column, 0.0, x0)).cost for column in rows.T])
+    promising = np.argsort(first, axis=0)[:2]
+    two, all_six = (extend(cartpole(), b, x0, neighbours=6, kept=kept) for kept in (2, None))
+    np.testing.assert_allclose(two.cost, np.take_along_axis(each, promising, axis=0).min(axis=0), rtol=1e-9)
+    assert (all_six.cost <= two.cost * (1 + 1e-9)).all()
+    assert two.iterations.sum() < all_six.iterations.sum() / 2
+
+
+def test_an_attempt_goes_as_far_as_it_is_told():
+    x0, solved = states()[:8], straight()[:8].success
+    begin, two = (cartpole().attempt(x0, iterations=n) for n in (1, 20))
+    whole, u = cartpole().attempt(x0, iterations=200)
+    assert two[1].shape == u.shape == (8, 40, 1)
+    assert (two[0] < begin[0]).all()
+    assert (whole <= two[0]).all()
+    np.testing.assert_allclose(whole[solved], straight().cost[:8][solved], rtol=1e-9)
+    assert (cartpole().attempt(x0, u=two[1])[0] <= two[0]).all()
+
+
 def test_nearest_is_nearest_at_that_time_and_sorted():
     b, s = bank(), bank().solution
     rng = np.random.default_rng(0)

@@ -11,6 +11,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -196,7 +197,7 @@ class Goals(table.PaperTable[Plan, Cell, Entry]):
         settings = TrainSettings.of(effort, parameters=ocp.np, value=False)
         cnd = train(ocp, model, seed=place.seed, settings=settings, progress=False)
         seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
-        gap, collisions = judged(ocp, cnd, plan.n, place.seed)
+        gap, collisions = judged(place.problem, cnd, plan.n, place.seed)
         return Cell(place.problem, place.way, place.seed, self.key(plan, place), gap.tolist(), collisions, identified,
                     seconds, cpu)
 
@@ -237,14 +238,24 @@ class Goals(table.PaperTable[Plan, Cell, Entry]):
         return {"": figure}
 
 
-def judged(ocp: OCP, cnd: Any, n: int, seed: int) -> tuple[Array, int]:
-    """(gap of each fresh (x0, p), collisions); the optimum from many starts, refined on FINE intervals."""
+def judged(problem: str, cnd: Any, n: int, seed: int) -> tuple[Array, int]:
+    """(gap of each fresh (x0, p), collisions) to the best of `optima` and of what the controller's own runs lead to."""
+    ocp = PROBLEMS[problem][1]()
     x0, p = drawn(ocp, n, seed)
-    report = compare(ocp, {"CND": cnd, "optimum": GlobalDDP(DDP(ocp, intervals=80), starts=32)}, x0=x0, p=p,
-                     progress=False)
-    report = with_reference(report, FINE)
-    gap = np.where(report.judged[0].simulation.success, report.gap[0] / 100, np.inf)
-    return gap, int((report.judged[0].simulation.violation > 0).sum())
+    own, reference = with_reference(compare(ocp, {"CND": cnd}, x0=x0, p=p, progress=False), FINE).judged
+    best = np.minimum(optima(problem, n, seed), reference.simulation.cost)
+    gap = np.where(own.simulation.success, (own.simulation.cost - best) / np.abs(best), np.inf)
+    return gap, int((own.simulation.violation > 0).sum())
+
+
+@lru_cache(maxsize=1)  # the ways of a problem come one after the other
+def optima(problem: str, n: int, seed: int) -> Array:
+    """[n], what the optimum of many starts costs at the fresh (x0, p), refined on FINE intervals."""
+    ocp = PROBLEMS[problem][1]()
+    x0, p = drawn(ocp, n, seed)
+    found = compare(ocp, {"optimum": GlobalDDP(DDP(ocp, intervals=80), starts=32)}, x0=x0, p=p, progress=False)
+    cost: Array = np.min([j.simulation.cost for j in with_reference(found, FINE).judged], axis=0)
+    return cost
 
 
 def _entry(problem: str, way: str, cells: Sequence[Cell]) -> Entry:

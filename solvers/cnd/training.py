@@ -36,7 +36,7 @@ from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.features import at_rate, own_features, policy_net
 from nocl.solvers.cnd.identity import identity
 from nocl.solvers.cnd.in_torch import InTorch
-from nocl.solvers.cnd.labels import NEIGHBOURS, Labels, Problems, answered, at_other_rates, tube, visited
+from nocl.solvers.cnd.labels import KEPT, NEIGHBOURS, Labels, Problems, answered, at_other_rates, tube, visited
 from nocl.solvers.cnd.paper import PaperSettings, train_paper
 from nocl.solvers.cnd.regress import fit_net, policy_loss
 from nocl.solvers.cnd.settings import TrainSettings
@@ -191,7 +191,8 @@ class Training:
             self.bank = SolutionBank.of(self.ddp, seeds)
             if s.states:
                 further = Problems.initial(self.ocp, s.states, rng)
-                more = extend(self.ddp, self.bank, further.x, NEIGHBOURS if self.ocp.np else 3, p=further.given_p)
+                several = {"neighbours": NEIGHBOURS, "kept": KEPT} if self.ocp.np else {}
+                more = extend(self.ddp, self.bank, further.x, p=further.given_p, **several)
                 self.bank = SolutionBank.of(self.ddp, type(more).join([seeds, more]))
             parts = [self.bank.solution] + ([tube(self.ddp, self.bank, s.tails, s.width, rng)] if s.tails else [])
             self.labels = Labels.join([self._labels(p, rng) for p in parts])

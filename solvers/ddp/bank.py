@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -191,18 +192,29 @@ class SolutionBank:
 
 
 def extend(ddp: DDP, bank: SolutionBank, x0: ArrayLike, neighbours: int = 3, t0: ArrayLike = 0.0,
-           p: Any = None) -> Solution:
-    """Solve new problems (x0 [B, nx], t0, p) from the nearest solutions of a bank: the best of `neighbours` starts."""
+           p: Any = None, kept: int | None = None) -> Solution:
+    """Solve new problems (x0 [B, nx], t0, p) from the nearest solutions of a bank: the best of `neighbours` starts.
+
+    kept : of these starts as many are followed to their ends, those that are cheapest after one iteration; default: all
+    """
     if neighbours < 1:
         raise ValueError(f"neighbours is {neighbours}; expected at least 1")
     rows, _ = checks.states(x0, ddp.ocp.system.nx, ddp.ocp.system.name)
-    best: Solution | None = None
     values = ddp.ocp.parameters_of(p, len(rows), "extend") if ddp.ocp.np else None
-    for near in bank.nearest(rows, t0, count=neighbours, p=values).T:
-        solution = ddp.solve(rows, t0, p=values, **bank.guess(near, t0, rows))
-        best = solution if best is None else better(best, solution)
-    assert best is not None
-    return best
+    guesses = [bank.guess(near, t0, rows) for near in bank.nearest(rows, t0, count=neighbours, p=values).T]
+    if kept is not None and kept < len(guesses):
+        guesses = _cheapest(ddp, rows, t0, values, guesses, kept)
+    found = [ddp.solve(rows, t0, p=values, **guess) for guess in guesses]
+    return reduce(better, found)
+
+
+def _cheapest(ddp: DDP, x0: Array, t0: ArrayLike, p: Array | None, guesses: list[dict[str, Array]],
+              kept: int) -> list[dict[str, Array]]:
+    """Of the guesses those that are cheapest after one iteration, for each problem: `kept` of them, the best first."""
+    tried = [ddp.attempt(x0, t0, p=p, **guess) for guess in guesses]
+    cost = np.nan_to_num(np.stack([J for J, _ in tried]), nan=np.inf)
+    controls, problems = np.stack([u for _, u in tried]), np.arange(len(x0))
+    return [{"u": controls[row, problems]} for row in np.argsort(cost, axis=0, kind="stable")[:kept]]
 
 
 def better(a: Solution, b: Solution) -> Solution:

@@ -14,6 +14,7 @@ import os
 import sys
 import warnings
 from collections import Counter
+from dataclasses import replace
 from functools import cached_property, lru_cache
 from importlib.metadata import version
 from pathlib import Path
@@ -166,6 +167,19 @@ class DDP:
         if self.between and isinstance(work, Augmented):
             self._exchange(work)
         return work.solution(batch.curvature)
+
+    def attempt(self, x0: Array, t0: ArrayLike = 0.0, *, p: Array | None = None, iterations: int = 1,
+                **guess: Array) -> tuple[Array, Array]:
+        """(cost [B], u [B, K, nu]) after so many iterations from a guess of `solve`'s, to choose among guesses by."""
+        brief = self._with_threads(self.threads)
+        brief.settings = replace(self.settings, max_iterations=iterations)
+        cost, controls = np.empty(len(x0)), np.empty((len(x0), self.intervals, self.ocp.system.nu))
+        for batch in pieces(brief, x0, self._start_times(t0, len(x0)), self._guesses(len(x0), **guess), False, p):
+            given, here = batch.guess.get, slice(batch.first, batch.first + batch.size)
+            work = brief._work(batch.x0, batch.t0, given("u"), given("x"), given("gain"), batch.p)
+            work.descend()
+            cost[here], controls[here] = work.J, work.u
+        return cost, controls
 
     def _exchange(self, work: Augmented) -> None:
         """Hold constraints between nodes, by margins at them."""
