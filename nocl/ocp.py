@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -28,6 +28,7 @@ KINKS = ("solvers that use second derivatives may fail there; smooth it, nocl.sm
          "nocl.smooth_max(a, b, width), or split a control, nocl.split_controls(system, names)")
 PLACES = 256  # initial states that constraints are measured at
 SAMPLES = 64  # initial states, and parameters, that a problem is tried at on construction
+FEW = 5  # parameters, beside the usual ones, that constraints are tried at
 N_IMAGES, SAME_IMAGE = 16, 1e-9  # points of the box; relative to usual values, images that agree so far are one
 
 
@@ -115,6 +116,8 @@ class OCP:
         self._check_initial_states(owner)
         self._check_finite(owner)
         self._check_possible(owner)
+        if self.np:
+            self._warn_of_goal(owner)
         if self.kinks:
             warnings.warn(f"{owner}: {self.not_smooth}", UserWarning, stacklevel=3)
 
@@ -196,7 +199,7 @@ class OCP:
             bad = np.argwhere(~((goals >= lb) & (goals <= ub)))
             if len(bad):
                 row, i = bad[0]
-                raise ValueError(f"{owner}: {what} has {names[i]} = {goals[row, i]:g}{self._at(p[row])}, outside its "
+                raise ValueError(f"{owner}: {what} has {names[i]} = {goals[row, i]:g}{self.at_p(p[row])}, outside its "
                                  f"box [{lb[i]:g}, {ub[i]:g}]: move the goal or widen the system's bounds")
 
     def sample_parameters(self, n: int, seed: Seed = 0) -> Array:
@@ -214,10 +217,11 @@ class OCP:
         low, high = (bound[:self.system.np] for bound in self.parameter_box)
         return Uniform(low, high) if self.system.np else None
 
-    def _at(self, p: Array) -> str:
+    def at_p(self, p: Array | None) -> str:
         """Which parameters are meant, in words; "" where there are none."""
-        named = (f"{name} = {value:.4g}" for name, value in zip(self.parameter_names, p, strict=True))
-        return f" at {', '.join(named)}" if self.np else ""
+        if p is None or not self.np:
+            return ""
+        return f" at {', '.join(f'{name} = {v:.4g}' for name, v in zip(self.parameter_names, p, strict=True))}"
 
     def moments(self, n: int, seed: int = 0) -> dict[str, Array]:
         """n random times in [0, T] and parameters, as {"t": [n], "p": [n, np]}: for what is found out by trying."""
@@ -256,18 +260,46 @@ class OCP:
                 if bad.size:
                     where = "the goal" if bad[0] == 0 else "an initial state"
                     raise ValueError(f"{owner}: {order}{what} gives NaN or inf at {where}, x = {short(x[:, bad[0]])}"
-                                     f"{self._at(at['p'][bad[0]])}; expected finite values: square a norm, or smooth "
+                                     f"{self.at_p(at['p'][bad[0]])}; expected finite values: square a norm, or smooth "
                                      "it as sqrt(d^2 + 1e-6)")
         if self.system.np or self.system.uses_time:
             self._check_equations(owner)
 
     def _check_possible(self, owner: str) -> None:
-        """Try whether each constraint can be held somewhere in X x U; path constraints were never asked."""
-        along = [one for one in self.held if one.kind != PATH]
-        of, at_end = self.functions, [replace(one, expression=self._at_end(one.expression)) for one in self.held_at_end]
-        for these, at, bounds in ((along, of.arguments, self._box), (at_end, of.end, self._box_of_x)):
-            rows = Rows.made(these, self.system.u)
-            limits.check_possible(rows, at, self._samples(limits.TRIED), bounds, owner)
+        """Try whether each constraint can be held somewhere in X x U, those of parameters at several of them; path
+        constraints without parameters were never asked."""
+        at_end = [replace(one, expression=self._at_end(one.expression)) for one in self.held_at_end]
+        asked, samples = [one for one in self.held if one.kind != PATH], self._samples(limits.TRIED)
+        self._check_held(asked, at_end, samples, owner)
+        along, at_end = ([one for one in those if self._hangs_on_p(one)] for those in (self.held, at_end))
+        for p in self._several_parameters() if along or at_end else ():
+            samples["p"] = np.tile(p, (limits.TRIED, 1))
+            self._check_held(along, at_end, samples, owner + self.at_p(p))
+
+    def _check_held(self, along: Sequence[Constraint], at_end: Sequence[Constraint], samples: Places,
+                    owner: str) -> None:
+        for these, at, bounds in ((along, self.functions.arguments, self._box),
+                                  (at_end, self.functions.end, self._box_of_x)):
+            limits.check_possible(Rows.made(these, self.system.u), at, samples, bounds, owner)
+
+    def _hangs_on_p(self, one: Constraint) -> bool:
+        return any(ca.depends_on(c, self._all_p) for _, c in one.sides())
+
+    def _several_parameters(self) -> Array:
+        """[n, np], the nominal ones, the least, the largest, and a few of their distribution."""
+        return np.vstack([self.nominal, *self.parameter_box, self.sample_parameters(FEW)])
+
+    def _warn_of_goal(self, owner: str) -> None:
+        """Of constraints that the goal itself does not hold at some parameters."""
+        p = np.vstack([self.nominal, self.sample_parameters(SAMPLES)])
+        moments = {"t": np.full(len(p), self.longest), "p": p}
+        rows = self.functions.rows[:self.functions.rows.n_h]
+        h = self.h(*self.functions.node.columns(x=self.goals(p)[0], **moments)).full()
+        for i in map(int, np.flatnonzero((h < 0).any(axis=1))):
+            worst = int(h[i].argmin())
+            warnings.warn(f"{owner}: the goal itself does not hold {rows.of[i].title} at {(h[i] < 0).sum()} of "
+                          f"{len(p)} parameters tried, worst{self.at_p(p[worst])}, by {-h[i, worst]:.3g}: what ends "
+                          "there cannot reach it; move the goal, or where `parameters` lie", UserWarning, stacklevel=4)
 
     @property
     def _box_of_x(self) -> tuple[Array, Array]:
@@ -301,7 +333,7 @@ class OCP:
         if bad.size:
             i = int(bad[0])
             raise ValueError(f"{owner}: the equations of {s.name!r} or their Jacobian give NaN or inf inside the box, "
-                             f"at x = {short(x[i])}, u = {short(u[i])}, t = {at['t'][i]:.4g}{self._at(at['p'][i])}; "
+                             f"at x = {short(x[i])}, u = {short(u[i])}, t = {at['t'][i]:.4g}{self.at_p(at['p'][i])}; "
                              "expected finite values: change the equation, or shrink lbx, ubx or `parameters`")
 
     @cached_property

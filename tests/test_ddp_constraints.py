@@ -240,6 +240,17 @@ def test_infeasible_starts_are_told_from_others():
         assert np.array_equal(getattr(s, field)[[0, 2, 4]], getattr(alone, field)), field
 
 
+def test_what_cannot_be_held_is_told_with_its_parameters():
+    wall, system = nocl.parameter("wall", 0.8), mass().system
+    ocp = nocl.OCP(system, p=wall, horizon=2.0, running=ca.sumsqr(system.u), terminal=ca.sumsqr(system.x),
+                   x_goal=[0, 0], u_goal=[0], initial_states=nocl.Gaussian([0, 0], [0.1, 0.1]),
+                   parameters=nocl.Uniform([0.5], [1.0]), constraints={"wall": wall - system.x[0]})
+    s = DDP(ocp, intervals=20, substeps=1, threads=1).solve([[0.3, 2.2], [0.9, 0], [0, 0.1]], p=[[0.6], [0.7], [0.6]])
+    assert s.success.tolist() == [False, False, True]
+    assert "no plan holds 'wall' from here at wall = 0.6, worst at node" in s.message[0]
+    assert "the initial state itself violates 'wall' at wall = 0.7, worst" in s.message[1]
+
+
 def test_soft_constraints_are_the_penalty_as_before():
     ocp, x0 = mass(), [[0.3, 2.2], [0.0, 1.0]]
     soft = replace(ocp, running=ocp.functions.soft, path_constraints={})

@@ -642,3 +642,31 @@ def test_parameters_are_tried_apart_from_states():
     at, x = lag().moments(500), lag().initial_states.sample(500, own_numbers(0))
     drawn = np.c_[x, at["p"], at["t"]]
     assert np.abs(np.corrcoef(drawn.T) - np.eye(5)).max() < 0.2
+
+
+def limited(low, **held):
+    """A pendulum with a limit and a goal as parameters; held: constraints as functions of (x, limit)."""
+    limit, goal, s = nocl.parameter("limit", 1.0), nocl.parameter("goal", 0.0), nocl.load_ocp("pendulum").system
+    held = {kind: {"it": of(s.x, limit)} for kind, of in held.items()}
+    return nocl.OCP.quadratic(s, p=ca.vertcat(limit, goal), horizon=3.0, x_goal=[goal, 0], u_goal=[0],
+                              initial_states=nocl.Gaussian([np.pi, 0], [0.1, 0.1]),
+                              parameters=nocl.Uniform([low, -0.5], [1.0, 0.5]), **held)
+
+
+@pytest.mark.parametrize(("held", "said"), [
+    ({"constraints": lambda x, limit: 8.5 * limit - 1 - ca.fabs(x[1]) - 0 * x[0]}, None),
+    ({"constraints": lambda x, limit: limit - 0.6 - x[1]**2}, "at limit = 0.5, goal = -0.5: constraint 'it'.* nowhere"),
+    ({"path_constraints": lambda x, limit: x[1] - 9 * limit}, "at limit = 1, .*path constraint 'it'.* holds nowhere"),
+    ({"terminal_constraints": lambda x, limit: limit - 0.6 - x[1]**2}, "at limit = 0.5.* terminal constraint 'it'")])
+@pytest.mark.filterwarnings("ignore:.*the goal itself", "ignore:.*not smooth", "ignore:.*kink")
+def test_what_cannot_be_held_at_some_parameters_is_named(held, said):
+    if said is None:
+        assert limited(0.5, **held).np == 2
+        return
+    with pytest.raises(ValueError, match=said):
+        limited(0.5, **held)
+
+
+def test_a_goal_that_violates_a_constraint_at_some_parameters_is_named():
+    with pytest.warns(UserWarning, match=r"does not hold path constraint 'it' at \d+ of 65 .* worst at limit"):
+        limited(0.05, path_constraints=lambda x, limit: limit - x[0]**2)

@@ -147,15 +147,15 @@ class Augmented(Work):
 
     def _messages(self, t: Array) -> list[str]:
         message = super()._messages(t)
-        over, given = self._violations()
+        (over, given), words = self._violations(), self.ddp.ocp.at_p
         for i in np.flatnonzero(self.state == OUTSIDE):
             name, where = self._worst(given[i])
-            message[i] = f"infeasible: the initial state itself violates {name!r}, {where}: move it"
+            message[i] = f"infeasible: the initial state itself violates {name!r}{words(self.p[i])}, {where}: move it"
         told = (over.max(axis=1) > TOLD) & (self.state != OUTSIDE) & (self.state != BLEW_UP)
         for i in np.flatnonzero(told):
             name, where = self._worst(over[i])
             if self.state[i] in (NOT_HELD, NO_DESCENT):
-                message[i] = f"infeasible: no plan holds {name!r} from here, {where}"
+                message[i] = f"infeasible: no plan holds {name!r} from here{words(self.p[i])}, {where}"
             else:
                 message[i] += f"; {name!r} is left, {where}"
         for i in np.flatnonzero(self.cut):

@@ -163,7 +163,8 @@ def solved_by(ocp: OCP, t: Array, outcomes: Sequence[Outcome], p: Array | None =
 def failure(program: Transcription, x0: Array, starts: int, failed: Answer | None, p: Array | None = None) -> str:
     """Why none of the starts converged, by the most feasible of them."""
     reason, outcome = ("nothing was tried", "") if failed is None else (failed.message, failed.outcome)
-    return (f"no start of {starts} converged from x0 = {_text(x0)}{_at(program, p)}{outside(program, x0)}: {reason}; "
+    where = f"x0 = {_text(x0)}{program.ocp.at_p(p)}{outside(program, x0)}"
+    return (f"no start of {starts} converged from {where}: {reason}; "
             f"try {_remedy(outcome, program)}")
 
 
@@ -198,7 +199,7 @@ def violated_start(program: Transcription, x0: Array, t: float = 0.0, p: Array |
         return ""
     remedy = f"soft=[{block.rows.names[i]!r}]" if program.ocp.in_scales else "constraints='soft'"
     return (f"infeasible: {block.rows.title(i)} is violated by {-c[i]:.3g} at node 0, by x0 = {_text(x0)}"
-            f"{_at(program, p)} itself: move x0, or use {remedy}")
+            f"{program.ocp.at_p(p)} itself: move x0, or use {remedy}")
 
 
 def outside(program: Transcription, x0: Array) -> str:
@@ -207,13 +208,6 @@ def outside(program: Transcription, x0: Array) -> str:
     out = [f"{name} = {v:.4g} outside [{low:g}, {high:g}]" for name, v, low, high in
            zip(s.state_names, x0, s.lbx, s.ubx, strict=True) if not low <= v <= high]
     return f" (x0 is outside X: {', '.join(out)})" if out else ""
-
-
-def _at(program: Transcription, p: Array | None) -> str:
-    """The parameters in words, "" where there are none."""
-    if p is None or not len(p):
-        return ""
-    return f" at {', '.join(f'{n} = {v:.4g}' for n, v in zip(program.ocp.parameter_names, p, strict=True))}"
 
 
 def _text(x: Array) -> str:
