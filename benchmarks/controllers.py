@@ -12,6 +12,8 @@ and kicks that come late cost the one or the other more by chance: "kicked_loss"
 controller loses between kicks, each stretch against the optimum from the state where the kick left the controller.
 
 V is judged on fresh states, too: the hidden initial ones, and VALUE_STATES of the tube and of kicked rollouts each.
+
+A controller of every goal ("cartpole-goals", "quadrotor-goals") is judged at the paper's goal, like the others.
 """
 
 from __future__ import annotations
@@ -38,7 +40,7 @@ from nocl.nets import FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.cnd import TrainSettings
 from nocl.solvers.cnd.in_torch import InTorch
-from nocl.solvers.cnd.labels import policy_controls
+from nocl.solvers.cnd.labels import Problems, policy_controls
 from nocl.solvers.cnd.validate import feasible, kicked_optima, tube_optima, value_scores
 from nocl.solvers.ddp.bank import SolutionBank, better
 from nocl.solvers.ddp.global_search import solve_globally
@@ -51,11 +53,16 @@ COLD = 48  # cold starts from each of the worst states
 VALUE_STATES = 2048  # of the tube, and of kicked rollouts, on which V is judged
 
 
+def from_there(x: Array, t: Array) -> Problems:
+    """Problems without parameters."""
+    return Problems(x, t, np.zeros((len(x), 0)))
+
+
 def optimum(ocp: OCP, x0: Array, policy: FeatureNet) -> tuple[Solution, SolutionBank]:
     """The best solutions known from x0, on FINE intervals; those found on the usual grid as a bank."""
     coarse, fine = DDP(ocp, constraints="soft"), DDP(ocp, intervals=FINE, constraints="soft")
     found = solve_globally(coarse, x0, starts=8, seed=99)
-    own = policy_controls(policy, nocl.to_torch(ocp.system.f), x0, np.zeros(len(x0)), ocp.horizon, FINE)
+    own = policy_controls(policy, InTorch(ocp), from_there(x0, np.zeros(len(x0))), FINE)
     best = better(fine.solve(x0, u=np.repeat(found.u, FINE // coarse.intervals, axis=1)), fine.solve(x0, u=own))
     return best, SolutionBank.of(coarse, found[found.success])
 
@@ -85,9 +92,9 @@ def cost_of_kicks(ocp: OCP, policy: FeatureNet, run: Simulation, kicks: list[tup
     after = np.concatenate([run.x[:, slot * nodes] for slot, _ in kicks])
     dx = np.concatenate([dx for _, dx in kicks])
     t = np.repeat([slot * ocp.horizon / SLOTS for slot, _ in kicks], len(run.x))
-    ddp, f, V = DDP(ocp, intervals=FINE // 2, constraints="soft"), nocl.to_torch(ocp.system.f), []
+    ddp, in_torch, V = DDP(ocp, intervals=FINE // 2, constraints="soft"), InTorch(ocp), []
     for x in (after - dx, after):
-        V.append(ddp.solve(x, t, u=policy_controls(policy, f, x, t, ocp.horizon, ddp.intervals)).cost)
+        V.append(ddp.solve(x, t, u=policy_controls(policy, in_torch, from_there(x, t), ddp.intervals)).cost)
     with np.errstate(invalid="ignore"):  # inf - inf where neither was solved
         total: Array = (V[1] - V[0]).reshape(len(kicks), -1).sum(axis=0)
     return total
@@ -187,7 +194,8 @@ def spread(rows: list[dict[str, Any]], path: tuple[str, ...]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("problems", nargs="*", default=["cartpole", "acrobot", "quadrotor", "dubins", "pendulum"])
+    parser.add_argument("problems", nargs="*", default=["cartpole", "acrobot", "quadrotor", "dubins", "pendulum",
+                                                        "cartpole-goals", "quadrotor-goals"])
     parser.add_argument("--dynamics", nargs="+", default=["exact", "learned"], choices=["exact", "learned"])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--n", type=int, default=200)
@@ -202,8 +210,9 @@ def main() -> None:
     for seed, problem, dynamics in product(options.seeds, options.problems, options.dynamics):
         ocp, keep = load_problem(problem), options.keep if seed == options.seeds[0] else None
         cnd, seconds = trained(ocp, dynamics, seed, keep)
+        here = (ocp.at(ocp.nominal), cnd.at(ocp.nominal)) if ocp.np else (ocp, cnd)
         rows.append({"problem": problem, "dynamics": dynamics, "seed": seed, **seconds,
-                     **score(ocp, cnd, options.n, options.sigma)})
+                     **score(*here, options.n, options.sigma)})
         print(rows[-1], flush=True)
         provenance.write(options.results, rows, n=options.n, sigma=options.sigma)
         if keep:

@@ -47,7 +47,12 @@ TAILS = 200  # of the section learned
 SAME = 1e-3  # relative: costs this close are the same optimum
 
 
+GOALS = {"cartpole-goals": 2.0, "quadrotor-goals": 3.5}  # m, how far away goals lie
+
+
 def problem(name: str) -> nocl.OCP:
+    if name in GOALS:
+        return nocl.load_ocp(name.removesuffix("-goals"), goals=GOALS[name])
     if name != "cartpole, wide box":
         return nocl.load_ocp(name)
     box = nocl.Uniform(lb=[-2, -3, -np.pi, -5], ub=[2, 3, np.pi, 5])

@@ -42,9 +42,14 @@ def system(
                "u": f"{gain} N" if isinstance(gain, ca.SX) else f"{gain:g} N"})
 
 
-def ocp(*, horizon: float = 4.0, R: Vector = 0.01, P: Vector = 1.0, std: float = 0.1,
+def ocp(*, horizon: float = 4.0, R: Vector = 0.01, P: Vector = 1.0, std: float = 0.1, goals: float | None = None,
         **constants: Any) -> nocl.OCP:
-    """Swing up from hanging at rest, x0 ~ N([0, 0, pi, 0], std^2 I), within `horizon` seconds; constants: system's."""
+    """Swing up from hanging at rest, x0 ~ N([0, 0, pi, 0], std^2 I), within `horizon` seconds; constants: system's.
+
+    With goals=2 it is for every goal: where the cart is to stop is a parameter, anywhere within 2 m.
+    """
+    goal = nocl.parameter("goal", 0.0, "m")
+    free = {} if goals is None else {"p": goal, "parameters": nocl.Uniform([-goals], [goals])}
     return nocl.OCP.quadratic(
-        system(**constants), horizon=horizon, R=R, P=P, x_goal=np.zeros(4), u_goal=[0.0],
-        initial_states=nocl.Gaussian(mean=[0.0, 0.0, np.pi, 0.0], std=[std] * 4))
+        system(**constants), horizon=horizon, R=R, P=P, x_goal=[goal if free else 0.0, 0, 0, 0], u_goal=[0.0],
+        initial_states=nocl.Gaussian(mean=[0.0, 0.0, np.pi, 0.0], std=[std] * 4), **free)

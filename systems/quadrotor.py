@@ -42,12 +42,17 @@ def system(
 
 
 def ocp(*, horizon: float = 4.0, R: Vector = 0.01, P: Vector = 1.0, std: float = 1.0,
-        target: Vector = (3.0, 3.0, 3.0), **constants: float) -> nocl.OCP:
-    """From rest at a position ~ N(0, std^2 I) to rest at `target` [3] m; u* holds the weight; constants: system's."""
+        target: Vector = (3.0, 3.0, 3.0), goals: float | None = None, **constants: float) -> nocl.OCP:
+    """From rest at a position ~ N(0, std^2 I) to rest at `target` [3] m; u* holds the weight; constants: system's.
+
+    With goals=3.5 it is for every goal: the target is a parameter, anywhere within 3.5 m of 0 along each axis.
+    """
     quadrotor = system(**constants)
     level, idle = np.zeros(12), np.zeros(4)
     weight, per_thrust = -quadrotor.f(level, idle)[8], quadrotor.linearize(level, idle)[1][8, 0]  # g and 1 / mass
+    goal = ca.vertcat(*(nocl.parameter(f"goal_{axis}", at, "m") for axis, at in zip("xyz", target, strict=True)))
+    free = {} if goals is None else {"p": goal, "parameters": nocl.Uniform([-goals] * 3, [goals] * 3)}
     return nocl.OCP.quadratic(
-        quadrotor, horizon=horizon, R=R, P=P,
-        x_goal=[*target, *level[3:]], u_goal=[float(weight / per_thrust), 0.0, 0.0, 0.0],
-        initial_states=nocl.Gaussian(mean=level, std=[std] * 3 + [0.0] * 9))
+        quadrotor, horizon=horizon, R=R, P=P, x_goal=ca.vertcat(goal, level[3:]) if free else [*target, *level[3:]],
+        u_goal=[float(weight / per_thrust), 0.0, 0.0, 0.0],
+        initial_states=nocl.Gaussian(mean=level, std=[std] * 3 + [0.0] * 9), **free)
