@@ -44,6 +44,10 @@ def policies(ocp: nocl.OCP, cnd: nocl.CND, noise: Array) -> dict[str, Callable[.
             "estimated from noisy states": lambda x, t, p: noisy(x + noise * rng.standard_normal(x.shape), t, p)}
 
 
+def trained(ocp: nocl.OCP, effort: str) -> nocl.CND:
+    return nocl.train(ocp, settings=TrainSettings.of(effort, parameters=ocp.np, value=False), progress=False)
+
+
 def lost(cost: Array, best: Array) -> dict[str, float]:
     gap = 100 * (cost - best) / np.abs(best)
     median, p95 = np.percentile(gap, [50, 95], method="higher")
@@ -54,9 +58,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--effort", default="normal")
     parser.add_argument("--n", type=int, default=200)
+    parser.add_argument("--law", help="the folder of a controller of this problem, in place of training one")
     args = parser.parse_args()
     ocp = cartpole_problem(**POLE, **CART)
-    cnd = nocl.train(ocp, settings=TrainSettings.of(args.effort, parameters=ocp.np, value=False), progress=False)
+    cnd = nocl.CND.load(args.law) if args.law else trained(ocp, args.effort)
     x0, p = ocp.initial_states.sample(args.n, own_numbers(0, 7)), ocp.sample_parameters(args.n, own_numbers(0, 8))
     best = solve_globally(DDP(ocp, intervals=HOLD), x0, p=p, starts=16, progress=False)
     optimum = nocl.simulate(ocp, best.u, x0, p=p).cost
