@@ -1,9 +1,10 @@
-"""Keeps what `nocl reproduce gym|quadrotor|dubins|approaches --out RUN` made.
+"""Keeps what `nocl reproduce gym|quadrotor|dubins|approaches|goals --out RUN` made.
 
     python benchmarks/reproduce.py gym RUN         # -> results/reproduce_gym.json: way, problem, seed
     python benchmarks/reproduce.py quadrotor RUN   # -> results/reproduce_quadrotor.json
     python benchmarks/reproduce.py dubins RUN      # -> results/reproduce_dubins.json: the table's rows
     python benchmarks/reproduce.py approaches RUN  # -> results/reproduce_approaches.json: problem, way
+    python benchmarks/reproduce.py goals RUN       # -> results/reproduce_goals.json: the table's rows
 
 The tables themselves, over the seeds and beside the paper's numbers, are RUN/gym.md, RUN/quadrotor.md and so on.
 """
@@ -19,11 +20,12 @@ from typing import Any
 import numpy as np
 import provenance
 
-from nocl.comparisons.reproduce import approaches, dubins
+from nocl.comparisons.reproduce import approaches, dubins, goals
 from nocl.comparisons.reproduce.control import GYM_TABLE, QUADROTOR_TABLE
 from nocl.comparisons.reproduce.controllers import Cell
 
 CONTROL = {table.name: table for table in (GYM_TABLE, QUADROTOR_TABLE)}
+ENTRIES: dict[str, Any] = {"dubins": dubins.TABLE, "goals": goals.TABLE}  # their rows are kept, not their cells
 
 
 def summary(cell: Cell) -> dict[str, Any]:
@@ -53,11 +55,11 @@ def digits(x: float) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("table", choices=[*CONTROL, "dubins", "approaches"])
+    parser.add_argument("table", choices=[*CONTROL, *ENTRIES, "approaches"])
     parser.add_argument("run", type=Path)
     options = parser.parse_args()
-    if options.table == "dubins":
-        rows = [plain(entry) for entry in dubins.TABLE.entries(dubins.TABLE.finished(options.run))]
+    if table := ENTRIES.get(options.table):
+        rows = [plain(entry) for entry in table.entries(table.finished(options.run))]
     elif options.table == "approaches":
         rows = [plain(cell) for cell in approaches.TABLE.finished(options.run)]
     else:
