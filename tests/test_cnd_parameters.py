@@ -12,12 +12,13 @@ from lq import lq_value
 from movers import mover
 
 import nocl
-from nocl.solvers import DDP, NMPC
+from nocl.solvers import DDP, NMPC, solve_globally
 from nocl.solvers.cnd import CND, TrainSettings
 from nocl.solvers.cnd.features import features
 from nocl.solvers.cnd.in_torch import InTorch
-from nocl.solvers.cnd.labels import Labels, Problems, kicked_states, near
+from nocl.solvers.cnd.labels import Labels, Problems, kicked_states, near, rivals
 from nocl.solvers.cnd.training import Training
+from nocl.solvers.ddp.bank import SolutionBank
 
 QUICK = TrainSettings(intervals=40, seeds=8, starts=2, states=100, tails=800, visits=300, rounds=0, iterations=1000,
                       batch=512, hidden=(32, 32), value_initial=200, value_tails=1000, value_visits=200,
@@ -200,6 +201,21 @@ def test_more_are_drawn_near_the_problems_that_the_controller_is_worst_at():
     assert (more.p[:, 1] > 0.4).mean() > 0.8
     found = kicked_states(training.bank, policy, training.in_torch, 2000, 0.01, np.random.default_rng(3), around=hard)
     assert (found.p[:, 1] > 0.5).mean() > 0.45
+
+
+def test_several_neighbours_are_looked_at_where_optima_of_other_kinds_are_near():
+    """A linear-quadratic problem has one optimum; a pendulum may swing up on either side."""
+    def found(ocp):
+        ddp, first = DDP(ocp, intervals=40, substeps=1), Problems.initial(ocp, 60, np.random.default_rng(0))
+        bank = SolutionBank.of(ddp, solve_globally(ddp, first.x, p=first.p, starts=4, progress=False))
+        return rivals(ddp, bank, np.random.default_rng(1))
+
+    mass = nocl.parameter("mass", 1.0)
+    pendulum = nocl.OCP.quadratic(nocl.systems.pendulum.system(mass=mass, parameters=mass), horizon=3.0, x_goal=[0, 0],
+                                  u_goal=[0], initial_states=nocl.Gaussian([np.pi, 0], [0.1, 0.1]),
+                                  parameters=nocl.Uniform([0.7], [1.3]))
+    assert not found(mover())
+    assert found(pendulum)
 
 
 def test_states_that_lie_in_a_box_stay_in_it():

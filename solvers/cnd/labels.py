@@ -22,6 +22,7 @@ from nocl.translate.rk4 import rk4
 
 Policy = Callable[..., Tensor]  # (x, t[, p]) -> u
 NEIGHBOURS = 10  # starts of a tail of a problem with parameters: the nearest one's optimum may be of another kind
+PROBED, RARE, SAME = 300, 0.003, 1e-4  # states by which it is found out whether there are such; costs so close are one
 KEPT = 2  # of them: those cheapest after one iteration; as good as all of six, in a quarter of the time
 NEAR = 0.1  # how near hard problems more are drawn
 SMALL = 0.1  # of a usual cost: what is added to costs before anything is divided by them
@@ -95,12 +96,23 @@ def at_other_rates(ddp: DDP, solution: Solution, unit: float, rng: np.random.Gen
 
 
 def tube(ddp: DDP, bank: SolutionBank, n: int, width: float, rng: np.random.Generator) -> Solution:
-    """Tails from n random states near the bank's trajectories, each from the solution it is near; with parameters the
-    best of that and of starts from the nearest others.
+    """Tails from n random states near the bank's trajectories, each from the solution it is near; where several are
+    worth a look, the best of that and of starts from the nearest others.
     """
     rows, at = tube_states(ddp.ocp, bank, n, width, rng)
     own = ddp.solve(at.x, at.t, p=at.given_p, **bank.guess(rows, at.t, at.x))
-    return better(own, extend(ddp, bank, at.x, NEIGHBOURS, at.t, at.p, KEPT)) if ddp.ocp.np else own
+    several = bank.several > 1
+    return better(own, extend(ddp, bank, at.x, bank.several, at.t, at.given_p, KEPT)) if several else own
+
+
+def rivals(ddp: DDP, bank: SolutionBank, rng: np.random.Generator) -> bool:
+    """Whether of PROBED initial states more than RARE have a better optimum than the nearest solution leads to: near
+    another of NEIGHBOURS.
+    """
+    at = Problems.initial(ddp.ocp, PROBED, rng)
+    one = extend(ddp, bank, at.x, 1, p=at.given_p).cost
+    others = extend(ddp, bank, at.x, NEIGHBOURS, p=at.given_p, kept=KEPT).cost
+    return float((others < one - SAME * np.abs(one)).mean()) > RARE
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,12 +200,12 @@ def kicked_states(bank: SolutionBank, policy: Policy, torch_ocp: InTorch, n: int
 
 
 def answered(ddp: DDP, bank: SolutionBank, policy: Policy, torch_ocp: InTorch, at: Problems) -> Solution:
-    """Tails from there: the best of a start from the policy's own answer and of one from the nearest solution, or with
-    parameters from several of them.
+    """Tails from there: the best of a start from the policy's own answer and of one from the nearest solution, or from
+    several of them.
     """
     p = at.given_p
     own = ddp.solve(at.x, at.t, u=policy_controls(policy, torch_ocp, at, ddp.intervals, ddp.substeps), p=p)
-    return better(own, extend(ddp, bank, at.x, NEIGHBOURS if ddp.ocp.np else 1, at.t, p, KEPT))
+    return better(own, extend(ddp, bank, at.x, bank.several, at.t, p, KEPT))
 
 
 def kicked_rollout(torch_ocp: InTorch, policy: Policy, start: Problems, kick: Array, rng: np.random.Generator,

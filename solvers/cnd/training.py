@@ -19,7 +19,7 @@ import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,7 +36,7 @@ from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.features import at_rate, own_features, policy_net
 from nocl.solvers.cnd.identity import identity
 from nocl.solvers.cnd.in_torch import InTorch
-from nocl.solvers.cnd.labels import KEPT, NEIGHBOURS, Labels, Problems, answered, at_other_rates, tube, visited
+from nocl.solvers.cnd.labels import KEPT, NEIGHBOURS, Labels, Problems, answered, at_other_rates, rivals, tube, visited
 from nocl.solvers.cnd.paper import PaperSettings, train_paper
 from nocl.solvers.cnd.regress import fit_net, policy_loss
 from nocl.solvers.cnd.settings import TrainSettings
@@ -194,6 +194,8 @@ class Training:
                 several = {"neighbours": NEIGHBOURS, "kept": KEPT} if self.ocp.np else {}
                 more = extend(self.ddp, self.bank, further.x, p=further.given_p, **several)
                 self.bank = SolutionBank.of(self.ddp, type(more).join([seeds, more]))
+            if self.ocp.np and rivals(self.ddp, self.bank, self._rng(5_000_000)):
+                self.bank = replace(self.bank, several=NEIGHBOURS)
             parts = [self.bank.solution] + ([tube(self.ddp, self.bank, s.tails, s.width, rng)] if s.tails else [])
             self.labels = Labels.join([self._labels(p, rng) for p in parts])
             self.first = len(self.labels)
@@ -373,7 +375,7 @@ class Training:
                  "bank": _tensors({k: v for k, v in vars(self.bank.solution).items() if k != "message"})}
         meta = {"identity": self._identity(), "round": self.round, "history": self.history, "seconds": self.seconds,
                 "fitting": self.fitting, "fitting_cpu": self.fitting_cpu,
-                "first": self.first, "evaluations": self._evaluations()}
+                "first": self.first, "several": self.bank.several, "evaluations": self._evaluations()}
         self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
         store.save_checkpoint(self.checkpoint, state, meta)
 
@@ -386,7 +388,7 @@ class Training:
             return False
         arrays = _arrays(state["labels"])
         self.labels = Labels(**{"p": np.zeros((len(arrays["t"]), 0)), **arrays})  # no empty arrays are in files
-        self.bank = SolutionBank.from_arrays(self.ddp, _arrays(state["bank"]))
+        self.bank = replace(SolutionBank.from_arrays(self.ddp, _arrays(state["bank"])), several=meta.get("several", 1))
         self.round, self.history, self.first = meta["round"], meta["history"], meta["first"]
         self.seconds, self.fitting, self.fitting_cpu = meta["seconds"], meta["fitting"], meta["fitting_cpu"]
         self.evaluations = meta.get("evaluations", 0)

@@ -31,6 +31,7 @@ class SolutionBank:
     solution: Solution
     scale: Array  # [nx + np], one unit of distance in each state, then in each parameter
     periodic: tuple[int, ...] = ()  # states that are the same 2 pi further (OCP.periodic): distances are to images
+    several: int = 1  # how many of the nearest solutions are worth a look
 
     def __len__(self) -> int:
         return len(self.solution)
@@ -68,7 +69,7 @@ class SolutionBank:
         order = np.argsort(joined.cost, kind="stable")
         state = np.round(_places(joined.x[:, 0], joined.p)[order] / (EQUAL * self.scale))
         kept = order[np.sort(np.unique(state, axis=0, return_index=True)[1])]
-        return SolutionBank(joined[np.sort(kept)], self.scale, self.periodic)
+        return replace(self, solution=joined[np.sort(kept)])
 
     def save(self, folder: str | os.PathLike[str]) -> Path:
         """Write folder/bank.safetensors, data only, atomically."""
