@@ -251,6 +251,22 @@ def test_dubins_obstacle_is_the_disk():
     assert nocl.load_ocp("dubins", obstacle=False).h.numel_out() == 0
 
 
+@pytest.mark.parametrize(("name", "goals", "at"), [("cartpole", 2.0, [0.7]), ("quadrotor", 3.5, [-1.0, 2.0, 0.5])])
+def test_the_goal_may_be_a_parameter(name, goals, at):
+    """At the nominal goal it is the bundled problem, at another the one that is bundled for that goal."""
+    every, known = nocl.load_ocp(name, goals=goals), nocl.load_ocp(name)
+    np.testing.assert_array_equal(every.parameter_box, [[-goals] * len(at), [goals] * len(at)])
+    rng, s = np.random.default_rng(3), known.system
+    x, u = rng.uniform(s.lbx, s.ubx, (20, s.nx)).T, rng.uniform(s.lbu, s.ubu, (20, s.nu)).T
+    there = every.at(at)
+    shift = there.x_goal - known.x_goal
+    for one, x_of_known in ((every.at(every.nominal), x), (there, x - shift[:, None])):
+        np.testing.assert_allclose(one.G(x).full(), known.G(x_of_known).full(), rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(one.L(x, u).full(), known.L(x, u).full(), rtol=1e-12)
+        np.testing.assert_allclose(one.u_goal, known.u_goal)
+    np.testing.assert_array_equal(every.initial_states.mean, known.initial_states.mean)
+
+
 def test_hovering_thrust_follows_mass_and_gravity():
     ocp = nocl.load_ocp("quadrotor", mass=2.5, g=3.7, target=[1.0, 2.0, -1.0])
     np.testing.assert_allclose(ocp.u_goal, [2.5 * 3.7, 0, 0, 0], rtol=1e-15)
