@@ -72,9 +72,9 @@ def compare(ocp: OCP, methods: Mapping[str, Any], n: int = 100, x0: ArrayLike | 
     why = impossible(ocp, states, solved, [j.simulation.u[:, :-1] for j in judged], most)
     base = base_cost(ocp, states, most)
     drawn = f"drawn with seed {seed}"
-    settings = {"seed": seed if x0 is None and p is None else None, "n": len(states),
-                "hold": ", ".join("continuous" if rate is None else str(rate) for rate in rates),
-                "initial states": "given" if x0 is not None else drawn}
+    settings: dict[str, Any] = {"seed": seed if x0 is None and p is None else None, "n": len(states),
+                                "hold": ", ".join("continuous" if rate is None else str(rate) for rate in rates),
+                                "initial states": "given" if x0 is not None else drawn}
     if ocp.np:
         settings["parameters"] = "given" if p is not None else drawn
     if len(ocp.constraint_names):

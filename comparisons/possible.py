@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from nocl.comparisons.methods import Starts
 from nocl.data import Solution
@@ -21,14 +22,15 @@ INTERVALS = 80  # of the plans that are looked for
 STARTS = 8  # cold ones
 
 
-def impossible(ocp: OCP, starts: Starts, solved: Array, controls: Sequence[Array], tolerance: float) -> tuple[str, ...]:
+def impossible(ocp: OCP, starts: Starts, solved: NDArray[np.bool_], controls: Sequence[Array],
+               tolerance: float) -> tuple[str, ...]:
     """[B], why no plan holds the constraints from a state, "" where one does or nothing is known.
 
     solved [B]: where a method held them; controls: those of the methods' runs [B, K, nu], NaN where there are none;
     tolerance: of the constraints' scales.
     """
     message, open_rows = [""] * len(starts), np.flatnonzero(~solved)
-    if not len(ocp.functions.rows) + len(ocp.functions.end_rows):
+    if not open_rows.size or not ocp.constraint_names:
         return tuple(message)
     for i, why in zip(open_rows, _outside(ocp, starts[open_rows], tolerance), strict=True):
         message[i] = why

@@ -25,7 +25,7 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from nocl.constraints import TOLERANCE
 from nocl.ocp import OCP
@@ -63,8 +63,8 @@ class Simulation:
     violation: Array  # [B], the largest of any, as a share of that constraint's own scale (OCP.violation); 0: none
     success: Array  # [B] bool, whether it reached the horizon with all constraints held
     message: Sequence[str]  # [B], "" or what failed, at which time and state; or what is violated, and by how much
-    reached: Array  # [B] bool, whether it reached the horizon
-    worst: Array  # [B] int, which row of OCP.shares is violated most; -1: none is
+    reached: NDArray[np.bool_]  # [B], whether it reached the horizon
+    worst: NDArray[np.int64]  # [B], which row of OCP.shares is violated most; -1: none is
 
 
 def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: int | None = None, nodes: int = 81,
@@ -477,7 +477,7 @@ class _Judge:
                           reached & ~beyond, message, reached, worst)
 
     @staticmethod
-    def worst(shares: Array) -> Array:
+    def worst(shares: Array) -> NDArray[np.int64]:
         """[B], the row that is violated most, -1 where none is."""
         found = np.c_[np.zeros(len(shares)), shares].argmax(axis=1) - 1
         return np.asarray(found, dtype=np.int64)

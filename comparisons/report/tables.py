@@ -211,7 +211,7 @@ def failures(report: Results) -> Table:
 
 def impossible(report: Results) -> Table:
     """The states that do not count, and why."""
-    body = [[str(i), x0_text(report, i), report.impossible[i]] for i in np.flatnonzero(~report.counted)]
+    body = [[str(i), x0_text(report, i), report.impossible[i]] for i in np.flatnonzero(~report.counted).tolist()]
     return Table("Left out: no plan holds the constraints", ["state", "x0", "why"], body,
                  "By DDP, from cold starts and from what the methods did: the word of a local solver.", text=True)
 
