@@ -61,7 +61,7 @@ class Simulation:
     clearance: Array  # [B], min of all constraints, at and between nodes, and at the end, in units of their scales; of
     # a problem with path constraints alone in their own units; inf if there are none
     violation: Array  # [B], the largest of any, as a share of that constraint's own scale (OCP.violation); 0: none
-    success: Array  # [B] bool, whether it reached the horizon with all constraints held
+    success: NDArray[np.bool_]  # [B], whether it reached the horizon with all constraints held
     message: Sequence[str]  # [B], "" or what failed, at which time and state; or what is violated, and by how much
     reached: NDArray[np.bool_]  # [B], whether it reached the horizon
     worst: NDArray[np.int64]  # [B], which row of OCP.shares is violated most; -1: none is
