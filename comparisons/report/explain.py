@@ -102,8 +102,8 @@ def _manners(report: Results, m: int, b: int | None, i: int) -> Iterator[str]:
 
 def _neighbours(report: Results, ways: _Ways, m: int, i: int) -> Iterator[str]:
     """Whether the states about it fare the same, and whether their best runs take its best run's way."""
-    near = ways.near[i]
-    if not len(near):
+    near = [n for n in ways.near[i] if report.counted[n]]
+    if not near:
         return
     gaps, name = report.gap[m, near], report.judged[m].name
     median = float(np.median(gaps))
