@@ -44,7 +44,6 @@ def audit(report: Report, methods: Mapping[str, Any], model: Any = None) -> tupl
     """
     from nocl.support.threads import one_thread  # with torch
 
-    report.ocp.refuse_constraints("audit", "compare tells what it can")
     learned = None if model is None else dynamics_function(report.ocp, model)
     with one_thread():
         return tuple(_audit(report, judged, methods[judged.name], learned, getattr(model, "doubt", None))
@@ -138,7 +137,7 @@ def _value(report: Report, judged: Judged, method: Any) -> ValueAudit | None:
     slope = _hamiltonian_gradient(ocp)(*of.stage.columns(**at), slopes.T).full().T
     start = derivatives(report.x0[:, None], s.t[:1])[0][:, 0]
     return ValueAudit(start, np.abs(start - s.cost), *_against_costate(report, derivatives), s.t, hjb,
-                      np.linalg.norm(_free(ocp, u, slope), axis=1).reshape(B, -1))
+                      _slope_size(ocp, u, slope).reshape(B, -1))
 
 
 def _derivatives(V: ca.Function, p: Array) -> Callable[[Array, Array], tuple[Array, Array, Array]]:
@@ -163,6 +162,12 @@ def _hamiltonian_gradient(ocp: OCP) -> ca.Function:
     at, costate = ocp.functions.stage, ca.SX.sym("costate", ocp.system.nx)
     H_u = ca.gradient(at.hamiltonian(costate, soft=False), at.u)
     return at.function("H_u", {"H_u": ca.densify(H_u)}, costate=costate)
+
+
+def _slope_size(ocp: OCP, u: Array, slope: Array) -> Array:
+    """||dH/du|| of rows; NaN where constraints hold the control: what pushes against them is not known."""
+    size = np.linalg.norm(_free(ocp, u, slope), axis=1)
+    return np.full(len(size), np.nan) if ocp.functions.rows.of_u.any() else size
 
 
 def _free(ocp: OCP, u: Array, slope: Array) -> Array:

@@ -16,13 +16,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from nocl.comparisons.baselines import base_cost
 from nocl.comparisons.each import Laws
 from nocl.comparisons.judging import Disturbance, Judgement, Judging, judge
-from nocl.comparisons.methods import MethodRun, Solving, Starts, Value, checked, is_count, rates_of, runs_of
+from nocl.comparisons.methods import MethodRun, Rates, Solving, Starts, Value, checked, is_count, rates_of, runs_of
+from nocl.comparisons.possible import impossible
 from nocl.comparisons.report.report import Report
-from nocl.comparisons.report.results import (
-    Judged,
-)
+from nocl.comparisons.report.results import Judged
+from nocl.constraints import TOLERANCE
 from nocl.ocp import OCP
 from nocl.support import checks
 from nocl.support.checks import Array
@@ -31,7 +32,8 @@ from nocl.support.pool import Pool
 
 def compare(ocp: OCP, methods: Mapping[str, Any], n: int = 100, x0: ArrayLike | None = None, seed: int = 1,
             hold: int | Sequence[int | None] | None = None, workers: int | str = 1,
-            out: str | os.PathLike[str] | None = None, progress: bool | None = None, p: Any = None) -> Report:
+            out: str | os.PathLike[str] | None = None, progress: bool | None = None, p: Any = None,
+            tolerance: float = TOLERANCE) -> Report:
     """Judge `methods` (by name) on the same initial states: x0 [nx] or [B, nx], else n drawn with `seed`.
 
     On a problem with parameters each state has its own p, drawn with `seed` too. Methods that know no p are made anew
@@ -47,10 +49,14 @@ def compare(ocp: OCP, methods: Mapping[str, Any], n: int = 100, x0: ArrayLike | 
     out : a folder that gets each part's outcome as soon as it is there: the same call resumes what is there. A plain
         callable is known by its name: another one of that name needs another folder
     progress : bars with the time left on stderr; default: where that is a terminal
+    tolerance : a run that violates a constraint by more than this share of its scale has failed
 
     Nothing is dropped: where a method raises, does not converge or blows up, its row says so. Milliseconds: a solver's
     own `seconds` for that state (the whole control trajectory; without them, its wall time over the number of states);
     for a controller the median time of one control evaluation there; for NMPC's loop those of its own solves.
+
+    Where no method holds the constraints from a state, DDP is asked whether a plan does; a state from which none was
+    found is told apart, and counts in no row.
 
     Raises ValueError for methods that are none, or are made for another problem.
     """
@@ -60,18 +66,30 @@ def compare(ocp: OCP, methods: Mapping[str, Any], n: int = 100, x0: ArrayLike | 
     Pool(workers)  # refuses what is none before anything is solved
     states = starts_of(ocp, n, x0, seed, p)
     rates, folder = rates_of(hold), None if out is None else Path(out)
-    start = time.perf_counter()
-    runs = runs_of(ocp, checked(methods), states, rates, Solving(workers, folder, progress))
-    job = Judging(ocp, states, runs, Disturbance(), [0.0] * len(runs))
-    judgements = judge(job, workers, None if folder is None else folder / "judged", progress, "judging")
-    judged = tuple(_judged(ocp, run, judgement, states) for run, judgement in zip(runs, judgements, strict=True))
+    most, start = checks.number(tolerance, "tolerance", "compare"), time.perf_counter()
+    judged = judged_runs(ocp, methods, states, rates, Solving(workers, folder, progress), most)
+    solved = np.any([j.feasible for j in judged], axis=0)
+    why = impossible(ocp, states, solved, [j.simulation.u[:, :-1] for j in judged], most)
+    base = base_cost(ocp, states, most)
     drawn = f"drawn with seed {seed}"
-    settings = {"seed": seed if x0 is None and p is None else None, "n": len(states),
-                "hold": ", ".join("continuous" if rate is None else str(rate) for rate in rates),
-                "initial states": "given" if x0 is not None else drawn}
+    settings: dict[str, Any] = {"seed": seed if x0 is None and p is None else None, "n": len(states),
+                                "hold": ", ".join("continuous" if rate is None else str(rate) for rate in rates),
+                                "initial states": "given" if x0 is not None else drawn}
     if ocp.np:
         settings["parameters"] = "given" if p is not None else drawn
-    return Report(ocp, states.x, judged, settings, time.perf_counter() - start, states.p)
+    if len(ocp.constraint_names):
+        settings["tolerance"] = most
+    return Report(ocp, states.x, judged, settings, time.perf_counter() - start, states.p, base=base, impossible=why)
+
+
+def judged_runs(ocp: OCP, methods: Mapping[str, Any], states: Starts, rates: Rates, solving: Solving,
+                tolerance: float) -> tuple[Judged, ...]:
+    """The methods' runs, as the judge sees them."""
+    runs = runs_of(ocp, checked(methods), states, rates, solving)
+    job = Judging(ocp, states, runs, Disturbance(), [0.0] * len(runs), tolerance=tolerance)
+    folder = None if solving.out is None else solving.out / "judged"
+    judgements = judge(job, solving.workers, folder, solving.progress, "judging")
+    return tuple(_judged(ocp, run, judgement, states) for run, judgement in zip(runs, judgements, strict=True))
 
 
 def starts_of(ocp: OCP, n: int, x0: ArrayLike | None, seed: int, p: Any) -> Starts:

@@ -22,7 +22,7 @@ from nocl.comparisons.judging import Disturbance, Judgement, Judging, judge, key
 from nocl.comparisons.methods import MethodRun, Solving, Starts, at_rate, checked, folder_name, how, runs_of
 from nocl.comparisons.reference import SLOTS, Reference, resolved
 from nocl.comparisons.report.findings import Robustness, Scenario, ScenarioLoss
-from nocl.comparisons.report.results import VIOLATION
+from nocl.constraints import TOLERANCE
 from nocl.judge import dynamics_function, simulate
 from nocl.ocp import OCP
 from nocl.solvers.ddp.global_search import solve_globally
@@ -64,18 +64,23 @@ class Disturbances:
 
 def robustness(ocp: OCP, methods: Mapping[str, Any], x0: ArrayLike, variants: Mapping[str, Any] | None = None,
                settings: Disturbances | None = None, workers: int | str = 1,
-               out: str | os.PathLike[str] | None = None, progress: bool | None = None, p: Any = None) -> Robustness:
+               out: str | os.PathLike[str] | None = None, progress: bool | None = None, p: Any = None,
+               tolerance: float = TOLERANCE) -> Robustness:
     """Judge `methods`, as compare takes them, from states x0 [B, nx] under each disturbance.
 
     p : parameters, where the problem has them: [np] for all, [B, np], or by name (OCP.parameters_of)
     variants : plants by name that the methods do not know, {"mass +20 %": system}: a System, an OCP (its system
         counts), a casadi.Function (x, u) -> xdot, or an object with `to_casadi()`
+    tolerance : a run that violates a constraint by more than this share of its scale has failed
+
+    Where no plan holds the constraints any more, after a kick or on another plant, there is no optimum, and the state
+    counts for no method.
     """
-    ocp.refuse_constraints("robustness")
+    ocp.refuse_free("robustness")
     rows, _ = checks.states(x0, ocp.system.nx, ocp.system.name)
     starts = Starts(rows.copy(), ocp.parameters_of(p, len(rows), "robustness"))
     return _Study(ocp, checked(methods), starts, settings or Disturbances(), workers,
-                  None if out is None else Path(out), progress).run(variants or {})
+                  None if out is None else Path(out), progress, tolerance).run(variants or {})
 
 
 def plant(ocp: OCP, variant: Any) -> ca.Function:
@@ -105,8 +110,9 @@ class _Study:
     """One call of robustness."""
 
     def __init__(self, ocp: OCP, methods: Mapping[str, Any], starts: Starts, settings: Disturbances,
-                 workers: int | str, out: Path | None, progress: bool | None) -> None:
+                 workers: int | str, out: Path | None, progress: bool | None, tolerance: float) -> None:
         self.ocp, self.starts, self.settings, self.workers, self.out = ocp, starts, settings, workers, out
+        self.tolerance = tolerance
         self.progress, self.x0, self.p = progress, starts.x, starts.p if ocp.np else None
         self.runs = runs_of(ocp, methods, self.starts, (None,), Solving(workers, out, progress))
         rate = settings.hold
@@ -122,7 +128,7 @@ class _Study:
         s, T = self.settings, self.ocp.horizon
         calm = self.judged("undisturbed", self.runs)
         guesses = [j.simulation.u[:, :-1] for j in calm]
-        ddp = DDP(self.ocp, constraints="soft")
+        ddp = DDP(self.ocp)
         cold = solve_globally(ddp, self.x0, p=self.p, starts=STARTS, seed=99, progress=self.progress).u
         best = Reference(self.ocp, FINE, [cold, *guesses]).solve(self.x0, self.p)
         J = best.cost
@@ -185,7 +191,7 @@ class _Study:
         late = [0.0 if run.solved is not None else d for run, d in
                 zip(runs, delays or [0.0] * len(runs), strict=True)]
         job = Judging(self.ocp, self.starts, list(runs), Disturbance(seed=self.settings.seed, **disturbance), late,
-                      timed=name == "undisturbed")
+                      timed=name == "undisturbed", tolerance=self.tolerance)
         folder = None if self.out is None else self.out / f"{folder_name(name)}-{key_of(job)[:12]}"
         return judge(job, self.workers, folder, self.progress, name)
 
@@ -193,10 +199,15 @@ class _Study:
                  delays: Sequence[float] | None = None) -> Scenario:
         losses = []
         for run, j, d in zip(runs, judgements, delays or [0.0] * len(runs), strict=True):
-            ok = np.asarray(j.simulation.success & ~(j.simulation.violation > VIOLATION), dtype=bool)
             said = run.how if run.solved is not None else how(run.hold, d)
-            losses.append(ScenarioLoss(run.name, said, j.simulation.cost, best, ok, j.ms_per_control))
+            ok = np.asarray(j.simulation.success, dtype=bool)
+            cost = np.where(ok, j.simulation.cost, np.inf)
+            losses.append(ScenarioLoss(run.name, said, cost, best, ok, j.ms_per_control, self.counted(best)))
         return Scenario(name, text, tuple(losses))
+
+    def counted(self, best: Array) -> Array:
+        """[B], the states that count: on a problem with constraints those from which a plan still holds them."""
+        return np.isfinite(best) if self.ocp.constraint_names else np.ones(len(best), dtype=bool)
 
 
 def _text(sigma: float | Sequence[float]) -> str:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from nocl.comparisons.each import Laws
 from nocl.comparisons.methods import STAGES, MethodRun, Starts, said, substeps_of
+from nocl.constraints import TOLERANCE
 from nocl.judge import Simulation, simulate
 from nocl.ocp import OCP
 from nocl.solvers.nmpc.loop import Loop
@@ -95,6 +96,7 @@ class Judging:
     disturbance: Disturbance
     delays: Sequence[float]
     timed: bool = True
+    tolerance: float = TOLERANCE  # of a constraint's scale
 
     def build(self) -> None:
         """Nothing is shared by the parts."""
@@ -107,7 +109,7 @@ class Judging:
         """By cloudpickle, so that users' functions reach processes too."""
         slim = [replace(run, method=None, solved=None if run.solved is None else
                         replace(run.solved, plan=None)) for run in self.runs]  # type: ignore[arg-type]
-        parts = (self.ocp, self.starts, slim, self.disturbance, self.delays, self.timed)
+        parts = (self.ocp, self.starts, slim, self.disturbance, self.delays, self.timed, self.tolerance)
         return _unpickled, (cloudpickle.dumps(parts),)
 
     def judge(self, run: MethodRun, rows: Rows, delay: float) -> Judgement:
@@ -142,7 +144,7 @@ class Judging:
         if d.noise is not None and run.hold is not None:
             controller = _Noisy(controller, self.ocp.horizon, run.hold, _noise(d, rows, run.hold))
         s = simulate(self.ocp, controller, starts.x, f=d.f, hold=run.hold, delay=delay,
-                     kicks=[(t, dx[rows]) for t, dx in d.kicks], p=starts.p)
+                     kicks=[(t, dx[rows]) for t, dx in d.kicks], p=starts.p, tolerance=self.tolerance)
         if isinstance(run.controller, Loop):
             return Judgement(s, *_of_loop(run.controller))
         if not self.timed:
@@ -164,7 +166,8 @@ class Judging:
 
     def _open_loop(self, run: MethodRun, rows: Rows, kicks: Sequence[tuple[float, Array]]) -> Simulation:
         starts = self.starts[rows]
-        return simulate(self.ocp, run.controller[rows], starts.x, f=self.disturbance.f, kicks=kicks, p=starts.p)
+        return simulate(self.ocp, run.controller[rows], starts.x, f=self.disturbance.f, kicks=kicks, p=starts.p,
+                        tolerance=self.tolerance)
 
 
 def _unpickled(data: bytes) -> Judging:
@@ -201,7 +204,7 @@ def key_of(job: Judging) -> str:
     d = job.disturbance
     arrays = [part for run in job.runs for part in run.identity] + [a for kick in d.kicks for a in kick]
     starts = [job.starts.x, *([job.starts.p] if job.ocp.np else [])]
-    return fingerprint(job.ocp.to_data(), *starts, *arrays, list(job.delays), d.seed,
+    return fingerprint(job.ocp.to_data(), *starts, *arrays, list(job.delays), d.seed, job.tolerance,
                        "" if d.f is None else d.f, "" if d.noise is None else d.noise, version("nocl"),
                        version("casadi"))
 
@@ -266,7 +269,7 @@ def failed(ocp: OCP, message: Sequence[str], t: Array) -> Simulation:
     inf, nan = np.full((4, B), np.inf), np.full((4, B), np.nan)
     x, u = (np.full((B, K, n), np.nan) for n in (ocp.system.nx, ocp.system.nu))
     return Simulation(t, x, u, inf[0], inf[1], inf[2], inf[3], nan[0], nan[1], nan[2], nan[3],
-                      np.zeros(B, dtype=bool), list(message))
+                      np.zeros(B, dtype=bool), list(message), np.zeros(B, dtype=bool), np.full(B, -1))
 
 
 def joined(ocp: OCP, parts: Sequence[Judgement]) -> Judgement:

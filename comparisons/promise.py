@@ -31,17 +31,21 @@ def interval(successes: int, n: int, confidence: float) -> tuple[float, float]:
 
 
 def promises(report: Report, within: float = WITHIN, confidence: float = CONFIDENCE) -> tuple[Promise, ...]:
-    """One promise a method. Empty where the states were given: they need to be independent draws.
+    """One promise a method, and on a problem with constraints one more, that it holds them. Empty where the states were
+    given: they need to be independent draws. States from which no plan holds the constraints are none of those meant.
 
     A state counts where the run violates nothing and costs at most `within` per cent more than the best known cost,
     over all methods here: it is a statement about that cost, not about an optimum that nobody found.
     """
-    if report.settings.get("seed") is None:
+    n = int(report.counted.sum())
+    if report.settings.get("seed") is None or not n:
         return ()
-    n, good = len(report.x0), report.within(within).sum(axis=1)
     of = "initial states and parameters of these distributions" if report.ocp.np else Promise.of
-    return tuple(Promise(j.name, within, confidence, n, int(k), lower_bound(int(k), n, confidence), of)
-                 for j, k in zip(report.judged, good, strict=True) if j.name != REFERENCE)
+    of += "" if report.counted.all() else " from which a plan holds the constraints"
+    kept = {within: report.within(within)} | ({None: report.feasible} if report.ocp.constraint_names else {})
+    return tuple(Promise(j.name, what, confidence, n, int(good[m].sum()),
+                         lower_bound(int(good[m].sum()), n, confidence), of)
+                 for what, good in kept.items() for m, j in enumerate(report.judged) if j.name != REFERENCE)
 
 
 def _check(successes: int, n: int, confidence: float) -> None:

@@ -21,7 +21,8 @@ class Reference:
     """The best of DDP's descents on `intervals` held controls, from each of `guesses` and from u*.
 
     A method's gap to the best known cost says little where that method found it: with this row beside it, no method is
-    measured against itself alone. Path constraints enter by the OCP's penalty; a row that violates one does not count.
+    measured against itself alone. Constraints hold, at the nodes and between them; a state from which no plan was found
+    that holds them has no reference.
 
     Parameters
     ----------
@@ -30,12 +31,12 @@ class Reference:
     """
 
     def __init__(self, ocp: OCP, intervals: int, guesses: Sequence[Array] = ()) -> None:
-        ocp.refuse_constraints("Reference")
+        ocp.refuse_free("Reference")
         self.ocp, self.intervals, self.guesses = ocp, intervals, list(guesses)
 
     def solve(self, x0: Array, p: Array | None = None) -> Solution:
         """The best solution of each state x0 [B, nx], p [B, np]; guesses are of the same."""
-        ddp = DDP(self.ocp, intervals=self.intervals, constraints="soft")
+        ddp = DDP(self.ocp, intervals=self.intervals, between=True)
         best = ddp.solve(x0, p=p)
         goal = self.ocp.goals(np.zeros((len(x0), 0)) if p is None else p)[1][:, None]
         for guess in self.guesses:
@@ -46,7 +47,7 @@ class Reference:
 
 def resolved(ocp: OCP, start: Solution, kicks: Sequence[tuple[int, Array]]) -> Array:
     """Cost [B] of the optimum that is solved anew after each kick (slot, dx [B, nx]), from the unkicked optimum;
-    inf where a solve failed.
+    inf where a solve failed: also where a kick leads to a state from which no plan holds the constraints.
 
     Slots rise; slot k is the time k T / SLOTS. The intervals of `start` are a multiple of SLOTS.
     """
@@ -61,7 +62,7 @@ def resolved(ocp: OCP, start: Solution, kicks: Sequence[tuple[int, Array]]) -> A
         x = np.where(found[:, None], solution.x[:, node] + dx, goal)  # what is lost may have blown up
         u = np.ascontiguousarray(solution.u[:, node:])
         states, gain = np.ascontiguousarray(solution.x[:, node:]), np.ascontiguousarray(solution.gain[:, node:])
-        ddp, t0 = DDP(ocp, intervals=K - slot * per_slot, constraints="soft"), slot * ocp.horizon / SLOTS
+        ddp, t0 = DDP(ocp, intervals=K - slot * per_slot), slot * ocp.horizon / SLOTS
         solution, now = better(ddp.solve(x, t0, u=u, x=states, gain=gain, p=start.p),
                                ddp.solve(x, t0, u=u, p=start.p)), slot
         found &= solution.success

@@ -11,7 +11,7 @@ from tqdm import tqdm
 from nocl.comparisons.promise import interval
 from nocl.comparisons.reference import Reference
 from nocl.comparisons.report.findings import Region, per_cent
-from nocl.comparisons.report.results import VIOLATION
+from nocl.constraints import TOLERANCE
 from nocl.judge import simulate
 from nocl.ocp import OCP
 from nocl.sampling import Distribution, Gaussian, Uniform, own_numbers
@@ -26,16 +26,17 @@ STARTS = 6  # cold starts of that optimum for each state
 
 
 def region(ocp: OCP, name: str, method: Any, scales: Sequence[float] = SCALES, n: int = 50, within: float = 5.0,
-           confidence: float = 0.95, seed: int = 2, progress: bool | None = None) -> Region:
+           confidence: float = 0.95, seed: int = 2, progress: bool | None = None,
+           tolerance: float = TOLERANCE) -> Region:
     """The share of n states that succeed at each scale of the distribution's spread, until more than half fail.
 
     With parameters each state has its own, drawn from where they lie: their distribution does not grow.
 
     A run succeeds that reaches the horizon, violates nothing and costs at most `within` per cent more than the best
     known: its own, or DDP's from cold starts, neighbours and the run itself. Every scale has the same draws, farther
-    out.
+    out. Farther out there may be states from which no plan holds the constraints: nobody succeeds there.
     """
-    ocp.refuse_constraints("region")
+    ocp.refuse_free("region")
     if not scales or min(scales) <= 0 or list(scales) != sorted(set(scales)):
         raise ValueError(f"scales is {scales!r}; expected rising numbers > 0, like (0.5, 1, 2)")
     states, good, p = list[Array](), list[Array](), ocp.sample_parameters(n, own_numbers(seed, 0, 1))
@@ -43,7 +44,7 @@ def region(ocp: OCP, name: str, method: Any, scales: Sequence[float] = SCALES, n
                disable=None if progress is None else not progress)
     for scale in bar:
         states.append(grown(ocp.initial_states, scale).sample(n, seed))
-        good.append(succeeds(ocp, method, states[-1], within, p))
+        good.append(succeeds(ocp, method, states[-1], within, p, tolerance))
         if good[-1].mean() < 0.5:
             bar.close()
             break
@@ -62,17 +63,15 @@ def grown(distribution: Distribution, scale: float) -> Distribution:
     return Uniform(centre + scale * (lb - centre), centre + scale * (ub - centre))
 
 
-def succeeds(ocp: OCP, method: Any, x0: Array, within: float, values: Array) -> Array:
+def succeeds(ocp: OCP, method: Any, x0: Array, within: float, values: Array, tolerance: float) -> Array:
     """[B] bool, of states with parameters values [B, np]. A state that violates a constraint itself, or that nobody
     solves, is no success."""
     p = values if ocp.np else None
-    run = simulate(ocp, method, x0, p=p)
+    run = simulate(ocp, method, x0, p=p, tolerance=tolerance)
     own = simulate(ocp, method, x0, hold=HELD, p=p).u[:, :-1]
     cold = solve_globally(DDP(ocp, intervals=HELD), x0, p=p, starts=STARTS, seed=0, workers=1, progress=False).u
     rival = Reference(ocp, HELD, [own, cold]).solve(x0, p)
-    judged = simulate(ocp, rival.u, x0, p=p)
-    fair = rival.success & ~(judged.violation > VIOLATION)
-    best = np.minimum(run.cost, np.where(fair, judged.cost, np.inf))
-    ok = run.success & ~(run.violation > VIOLATION)
+    judged = simulate(ocp, rival.u, x0, p=p, tolerance=tolerance)
+    best = np.minimum(run.cost, np.where(rival.success & judged.success, judged.cost, np.inf))
     with np.errstate(invalid="ignore"):
-        return np.asarray(ok & (per_cent(run.cost - best, best, usual_sizes(ocp).cost) <= within))
+        return np.asarray(run.success & (per_cent(run.cost - best, best, usual_sizes(ocp).cost) <= within))

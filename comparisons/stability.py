@@ -152,7 +152,7 @@ def _optimum(report: Report) -> list[Stability]:
         return []
     starts, u = given
     K = INTERVALS // u.shape[1] * u.shape[1] or u.shape[1]
-    ddp = DDP(ocp, intervals=K, constraints="soft")
+    ddp = DDP(ocp, intervals=K)
     guess = np.ascontiguousarray(np.repeat(u, K // u.shape[1], axis=1))
     found = ddp.solve(starts.x, u=guess, p=starts.p if ocp.np else None)
     found = found[found.success]

@@ -29,6 +29,7 @@ from nocl.translate.arguments import Arguments
 
 SAMPLES = 4096  # of X x U
 LOWEST = 4  # samples from which a minimum of c is descended to
+TOLERANCE = 1e-3  # of a constraint's scale: a run that violates it by more has failed
 NEVER = 1e-9  # of the spread of c over X x U: less deep than that is never violated there
 TRIED = 512  # samples at which a constraint is tried on construction: whether it can hold at all
 PATH, ALONG, BOUND, END = "path constraint", "constraint", "state bound", "terminal constraint"  # in messages

@@ -25,8 +25,9 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from nocl.constraints import TOLERANCE
 from nocl.ocp import OCP
 from nocl.scales import units
 from nocl.smoothness import kinks
@@ -42,12 +43,16 @@ AT_BOUND = 1e-9  # of the width of U: closer than this counts as saturated
 
 @dataclass(frozen=True, eq=False)
 class Simulation:
-    """B closed or open loops from t0 to the horizon; one that fails has success False, infinite cost and says why."""
+    """B closed or open loops from t0 to the horizon; one that fails has success False and says why.
+
+    A run fails that does not get to the horizon (`reached` False, the cost infinite), or that violates a constraint by
+    more than the tolerance: what it cost is told, and counts in no comparison.
+    """
 
     t: Array  # [K+1] nodes
     x: Array  # [B, K+1, nx], NaN after a failure; a kick at a node is included
     u: Array  # [B, K+1, nu], clipped to U; a held control stands for [t_k, t_{k+1}), the last one twice
-    cost: Array  # [B], running + terminal, inf where it failed
+    cost: Array  # [B], running + terminal, inf where the horizon was not reached
     running_cost: Array  # [B], integral of L, exact (no penalty)
     terminal_cost: Array  # [B], G(x(T))
     terminal_error: Array  # [B], ||x(T) - x*||_2, x* the nearest image of the goal (OCP.from_goal)
@@ -56,13 +61,15 @@ class Simulation:
     clearance: Array  # [B], min of all constraints, at and between nodes, and at the end, in units of their scales; of
     # a problem with path constraints alone in their own units; inf if there are none
     violation: Array  # [B], the largest of any, as a share of that constraint's own scale (OCP.violation); 0: none
-    success: Array  # [B] bool
-    message: Sequence[str]  # [B], "" or what failed, at which time and state
+    success: NDArray[np.bool_]  # [B], whether it reached the horizon with all constraints held
+    message: Sequence[str]  # [B], "" or what failed, at which time and state; or what is violated, and by how much
+    reached: NDArray[np.bool_]  # [B], whether it reached the horizon
+    worst: NDArray[np.int64]  # [B], which row of OCP.shares is violated most; -1: none is
 
 
 def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: int | None = None, nodes: int = 81,
              kicks: Kicks | None = None, delay: float = 0.0, t0: float = 0.0, p: Any = None, rtol: float = 1e-9,
-             atol: float = 1e-10) -> Simulation:
+             atol: float = 1e-10, tolerance: float = TOLERANCE) -> Simulation:
     """Run and score a controller on an OCP from states x0 [nx] or [B, nx].
 
     Parameters
@@ -77,6 +84,7 @@ def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: i
     delay : time from a sample of the state to its control, at most an interval; the last control acts meanwhile. The
         first control is there at once: where a run starts is known before it does
     t0 : start, so that a tail of the horizon can be judged
+    tolerance : a run that violates a constraint by more than this share of its scale has failed
 
     Raises ValueError for shapes that do not fit, and for a problem whose horizon is free. A state that blows up or a
     NaN control is a row with success False.
@@ -86,10 +94,11 @@ def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: i
     check_made_for(ocp, controller, "the controller")
     rows, _ = checks.states(x0, ocp.system.nx, ocp.system.name)
     t0 = _check_options(ocp, hold, nodes, t0)
-    for name, tolerance in (("rtol", rtol), ("atol", atol)):
-        checks.number(tolerance, name, "simulate", positive=True)
+    for name, value in (("rtol", rtol), ("atol", atol)):
+        checks.number(value, name, "simulate", positive=True)
+    most = checks.number(tolerance, "tolerance", "simulate")
     values = ocp.parameters_of(p, len(rows), "simulate")
-    judge = _Judge(ocp, dynamics_function(ocp, f), values, float(rtol), float(atol))
+    judge = _Judge(ocp, dynamics_function(ocp, f), values, float(rtol), float(atol), most)
     jumps = _jumps(ocp, kicks, len(rows), t0)
     policy = policy_function(ocp, controller)
     if policy is not None and hold is None:
@@ -275,8 +284,8 @@ def answer_of(controller: Any, x: Array, t: float, *p: Array | None) -> Any:
 class _Judge:
     """CVODES on one problem and plant; z = [x, integral of L]. p [B, np] are the parameters of each row."""
 
-    def __init__(self, ocp: OCP, f: ca.Function, p: Array, rtol: float, atol: float) -> None:
-        self.ocp, self.f, self.p = ocp, f, p
+    def __init__(self, ocp: OCP, f: ca.Function, p: Array, rtol: float, atol: float, tolerance: float) -> None:
+        self.ocp, self.f, self.p, self.tolerance = ocp, f, p, tolerance
         self.options = {"reltol": rtol, "abstol": atol, "quad_err_con": True, "disable_internal_warnings": True,
                         "show_eval_warnings": False, "max_num_steps": 20000}
 
@@ -450,17 +459,28 @@ class _Judge:
 
     def score(self, t: Array, x: Array, u: Array, running: Array, magnitude: Array, saturation: Array,
               least: Array, message: list[str]) -> Simulation:
-        success, ocp = np.array([not m for m in message]), self.ocp
-        x[~success, -1] = np.nan
+        reached, ocp = np.array([not m for m in message]), self.ocp
+        x[~reached, -1] = np.nan
         end = ocp.functions.end.columns(x=x[:, -1], p=self.p)
-        terminal = np.where(success, ocp.G(*end).full().ravel(), np.inf)
-        running = np.where(success, running, np.inf)
-        error = np.where(success, np.linalg.norm(ocp.from_goal(x[:, -1], self.p), axis=1), np.inf)
+        terminal = np.where(reached, ocp.G(*end).full().ravel(), np.inf)
+        running = np.where(reached, running, np.inf)
+        error = np.where(reached, np.linalg.norm(ocp.from_goal(x[:, -1], self.p), axis=1), np.inf)
         u[~np.isfinite(x).all(axis=2)] = np.nan
         at_end = ocp.least_at_end(x[:, -1], self.p)
-        return Simulation(t, x, u, running + terminal, running, terminal, error, np.where(success, magnitude, np.nan),
-                          np.where(success, saturation, np.nan), ocp.nearest(least, at_end),
-                          ocp.violation(least, at_end), success, message)
+        violation, worst = ocp.violation(least, at_end), self.worst(ocp.shares(least, at_end))
+        beyond = reached & (violation > self.tolerance)
+        for i in np.flatnonzero(beyond):
+            name, much = ocp.excess(worst[i], violation[i])
+            message[i] = f"violates {name!r} by {much}"
+        return Simulation(t, x, u, running + terminal, running, terminal, error, np.where(reached, magnitude, np.nan),
+                          np.where(reached, saturation, np.nan), ocp.nearest(least, at_end), violation,
+                          reached & ~beyond, message, reached, worst)
+
+    @staticmethod
+    def worst(shares: Array) -> NDArray[np.int64]:
+        """[B], the row that is violated most, -1 where none is."""
+        found = np.c_[np.zeros(len(shares)), shares].argmax(axis=1) - 1
+        return np.asarray(found, dtype=np.int64)
 
 
 class _Segment:

@@ -694,10 +694,27 @@ class OCP:
         least = checks.numeric(least, "least", "OCP.violation", f"least values [B, {m}]")
         if least.ndim != 2 or least.shape[1] != m or np.isnan(least).any():
             raise ValueError(f"OCP.violation: least is {checks.shown(least)}; expected [B, {m}], as OCP.least gives it")
+        return np.asarray(self.shares(least, end).max(axis=1, initial=0.0)) + 0.0
+
+    def shares(self, least: Array, end: Array | None = None) -> Array:
+        """By how much each row along the way, and then at the end, is violated, as shares of their scales; < 0: it is
+        held. Least values as `violation` has them.
+        """
         shares = -least / self.functions.scales
-        if end is not None:
-            shares = np.hstack([shares, -end / self.functions.end_scales])
-        return np.asarray(shares.max(axis=1, initial=0.0)) + 0.0
+        return shares if end is None else np.hstack([shares, -end / self.functions.end_scales])
+
+    def excess(self, row: int, share: float) -> tuple[str, str]:
+        """Whose row of `shares` it is, and a violation of it in its own unit: ("track", "0.12 m")."""
+        of = self.functions
+        one = (*of.rows.of, *of.end_rows.of)[row]
+        amount = share * np.concatenate([of.scales, of.end_scales])[row]
+        return one.name, f"{amount:.3g} {self._unit_of(one)}".rstrip()
+
+    def _unit_of(self, one: Constraint) -> str:
+        """The unit of a constraint whose expression is a state or a control; "" of any other."""
+        s = self.system
+        each = zip(s.names, ca.vertsplit(ca.vertcat(s.x, s.u)), strict=True)
+        return next((s.units.get(name, "") for name, z in each if ca.is_equal(one.expression, z)), "")
 
     @property
     def L_soft(self) -> ca.Function:

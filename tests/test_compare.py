@@ -180,14 +180,19 @@ def test_a_run_that_violates_a_constraint_is_never_the_best():
     straight, slow = (lambda x, t, v=v: np.tile([v, 0.0], (len(x), 1)) for v in (0.32, 0.1))
     report = compare(ocp, {"through": straight, "short of it": slow}, x0=x0, progress=False)
     through, short = report.rows()
-    assert through["cost"] < short["cost"]
+    paid = report.judged[0].simulation.cost[0]  # through the obstacle is cheaper, and no answer
+    assert paid < short["cost"] < through["cost"] == np.inf
+    assert (through["success"], through["reached"]) == (False, True)
+    assert through["message"].startswith("violates 'obstacle' by 0.")
     assert through["clearance"] < 0 < short["clearance"]
     assert (through["feasible"], short["feasible"]) == (False, True)
     assert through["best_method"] == short["best_method"] == "short of it"
-    assert through["gap"] < 0
+    assert through["gap"] == np.inf  # it counts in no mean and no gap
     assert [row["within_5"] for row in report.summary()] == [0, 100]
-    assert [row["violations"] for row in report.summary()] == [1, 0]
-    assert "through violates a path constraint on 1 of 1" in report.verdict()[-1]
+    assert [row["violations"] for row in report.summary()] == [row["failures"] for row in report.summary()] == [1, 0]
+    assert np.isnan(report.summary()[0]["cost_mean"])
+    assert "through violates 'obstacle' by 0." in report.verdict()[-1]
+    assert "(1 of 1)" in report.verdict()[-1]
 
 
 def test_a_solution_is_judged_as_it_is(ocp):

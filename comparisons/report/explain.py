@@ -34,9 +34,10 @@ def explained_method(report: Results) -> int:
 
 
 def worst_states(report: Results, m: int | None = None) -> list[int]:
-    """States by the gap of method m (the explained one), the widest first."""
+    """States by the gap of method m (the explained one), the widest first; those that count, or all if none does."""
     m = explained_method(report) if m is None else m
-    return np.argsort(-report.gap[m], kind="stable").tolist()
+    order = np.argsort(-report.gap[m], kind="stable")
+    return order[report.counted[order]].tolist() if report.counted.any() else order.tolist()
 
 
 def worst(report: Results, k: int = 5, m: int | None = None) -> list[Explained]:
@@ -50,8 +51,10 @@ def worst(report: Results, k: int = 5, m: int | None = None) -> list[Explained]:
 def _sentences(report: Results, ways: _Ways, m: int, i: int) -> Iterator[str]:
     j, s = report.judged[m], report.judged[m].simulation
     b = _best(report, i)
-    if not s.success[i]:
+    if not s.reached[i]:
         yield f"{j.name} failed: {s.message[i]}."
+    elif not s.success[i]:
+        yield f"{j.name} failed: it {s.message[i]}, at a cost of {number(s.cost[i])}."
     elif b is None:
         yield f"Cost {number(s.cost[i])}; no method has an answer that counts here, so that there is no gap."
     elif b == m:
@@ -60,9 +63,9 @@ def _sentences(report: Results, ways: _Ways, m: int, i: int) -> Iterator[str]:
         yield (f"Cost {number(s.cost[i])} against {number(report.best[i])} by {report.best_method[i]}: "
                f"{percent(max(report.gap[m, i], 0.0))} % more.")
         yield _lost_where(report, m, b, i)
-    if s.success[i]:
+    if s.reached[i]:
         yield from _manners(report, m, b, i)
-    if b is not None and b != m and s.success[i]:
+    if b is not None and b != m and s.reached[i]:
         yield ways.compared(m, b, i)
     if b != m:
         yield from _neighbours(report, ways, m, i)
@@ -89,10 +92,8 @@ def _lost_where(report: Results, m: int, b: int, i: int) -> str:
 
 
 def _manners(report: Results, m: int, b: int | None, i: int) -> Iterator[str]:
-    """Collision and saturation."""
+    """Saturation."""
     s = report.judged[m].simulation
-    if not report.feasible[m, i]:
-        yield f"It {report.violated(m, i)}."
     if s.saturation[i] > 0.05:
         beside = f", the best run's {100 * report.judged[b].simulation.saturation[i]:.0f} %" if b not in (None, m) \
             else ""
@@ -101,8 +102,8 @@ def _manners(report: Results, m: int, b: int | None, i: int) -> Iterator[str]:
 
 def _neighbours(report: Results, ways: _Ways, m: int, i: int) -> Iterator[str]:
     """Whether the states about it fare the same, and whether their best runs take its best run's way."""
-    near = ways.near[i]
-    if not len(near):
+    near = [n for n in ways.near[i] if report.counted[n]]
+    if not near:
         return
     gaps, name = report.gap[m, near], report.judged[m].name
     median = float(np.median(gaps))

@@ -9,10 +9,11 @@ import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
 
+from nocl.comparisons.report import limits
 from nocl.comparisons.report.explain import explained_method, worst_states
 from nocl.comparisons.report.results import Results, percent
 from nocl.comparisons.report.study_figures import study_figures
-from nocl.comparisons.report.style import COLOURS, SMALL_GAP, STYLE, look, plain
+from nocl.comparisons.report.style import COLOURS, LIMIT, SMALL_GAP, STYLE, look, plain
 from nocl.support.checks import Array
 
 
@@ -45,7 +46,7 @@ def gaps(report: Results) -> Figure:
     """Share of initial states within a gap; a method's line ends below 100 % where it failed."""
     figure = Figure(figsize=(7, 3.6), layout="constrained")
     ax = figure.subplots()
-    n = len(report.x0)
+    n = max(int(report.counted.sum()), 1)
     right = max(10.0, 2 * float(np.max(report.gap, where=np.isfinite(report.gap), initial=0.0)))
     for m, judged in enumerate(report.judged):
         known = np.sort(report.gap[m][report.feasible[m] & np.isfinite(report.gap[m])])
@@ -84,9 +85,10 @@ def costs(report: Results) -> Figure:
 
 
 def trajectories(report: Results, states: Sequence[int]) -> Figure:
-    """States and controls over time; a column for each initial state, a line for each method."""
-    s = report.ocp.system
-    names = [plain(s.unit(name)) for name in s.names]
+    """States, controls and constraints over time; a column for each initial state, a line for each method."""
+    s, bounds, held = report.ocp.system, limits.lines(report.ocp), limits.others(report.ocp)
+    names = [*(plain(s.unit(name)) for name in s.names), *(plain(one.name) for one in held)]
+    beside = [limits.values(report.ocp, j.simulation, report.parameters) for j in report.judged]
     width, height = 3.1 * len(states) + 0.9, 1.15 * len(names) + 0.9
     figure = Figure(figsize=(width, height))  # laid out in inches: the layout engines take seconds on so many axes
     edges = {"left": 0.75 / width, "right": 1 - 0.1 / width, "bottom": 0.45 / height, "top": 1 - 0.55 / height}
@@ -96,11 +98,17 @@ def trajectories(report: Results, states: Sequence[int]) -> Figure:
         axes[0, c].set_title(f"state {i}: " + _gap_title(report, i), fontsize=8)
         axes[-1, c].set_xlabel("t")
         for m, judged in enumerate(report.judged):
-            _draw_run(axes[:, c], judged.simulation.t, judged.simulation.x[i], judged.simulation.u[i], m, judged.name,
-                      steps=judged.held)
+            run = np.hstack([judged.simulation.x[i], judged.simulation.u[i], beside[m][i]])
+            steps = range(s.nx, s.nx + s.nu) if judged.held else range(0)
+            _draw_run(axes[:, c], judged.simulation.t, run, m, judged.name, steps)
         goals = np.concatenate(report.ocp.goals(report.parameters[[i]]), axis=1)[0]
-        for ax, goal in zip(axes[:, c], goals, strict=True):
+        for ax, goal in zip(axes[:, c], goals, strict=False):  # constraints have none
             ax.axhline(goal, color="0.6", linewidth=0.7, zorder=0)
+        for line in bounds:
+            _draw_limit(axes[line.channel, c], line.value, line.at_end)
+        for ax, one in zip(axes[len(s.names):, c], held, strict=True):
+            for bound in (one.low, one.high):
+                _draw_limit(ax, bound, False)
     for ax, name in zip(axes[:, 0], names, strict=True):
         ax.set_ylabel(name)
     handles, labels = axes[0, 0].get_legend_handles_labels()
@@ -112,12 +120,20 @@ def trajectories(report: Results, states: Sequence[int]) -> Figure:
 def _gap_title(report: Results, i: int) -> str:
     m = explained_method(report)
     gap, name = report.gap[m, i], plain(report.judged[m].name)
+    if not report.counted[i]:
+        return "no plan holds the constraints"
     return f"{name} +{percent(max(gap, 0.0))} %" if np.isfinite(gap) else f"{name} failed"
 
 
-def _draw_run(axes: Any, t: Array, x: Array, u: Array, m: int, name: str, steps: bool) -> None:
-    nx = x.shape[1]
+def _draw_run(axes: Any, t: Array, run: Array, m: int, name: str, steps: range) -> None:
+    """Of run [K+1, rows] each row, those in `steps` held from node to node."""
     for k, ax in enumerate(axes):
-        y = x[:, k] if k < nx else u[:, k - nx]
-        style = {"drawstyle": "steps-post"} if steps and k >= nx else {}
-        ax.plot(t, y, linewidth=1.3, label=plain(name), **style, **look(m))
+        style = {"drawstyle": "steps-post"} if k in steps else {}
+        ax.plot(t, run[:, k], linewidth=1.3, label=plain(name), **style, **look(m))
+
+
+def _draw_limit(ax: Any, value: float, at_end: bool) -> None:
+    """A bound, where it is not far from what is drawn."""
+    low, high = ax.get_ylim()
+    if 2 * low - high <= value <= 2 * high - low:
+        ax.axhline(value, xmin=0.94 if at_end else 0.0, color=LIMIT, linewidth=1, linestyle="-" if at_end else "--")

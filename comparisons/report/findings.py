@@ -18,7 +18,11 @@ Row = dict[str, Any]
 
 
 def percentile(values: Array, q: float) -> float:
-    """The q-th percentile; where some are inf (failures) the nearest value above, since inf cannot be interpolated."""
+    """The q-th percentile; where some are inf (failures) the nearest value above, since inf cannot be interpolated; NaN
+    of nothing.
+    """
+    if not len(values):
+        return math.nan
     return float(np.percentile(values, q, method="linear" if np.isfinite(values).all() else "higher"))
 
 
@@ -122,8 +126,9 @@ class ScenarioLoss:
     how: str  # how its control was run: rate, delay
     cost: Array  # [B], inf where it failed
     best: Array  # [B], cost of the optimum solved anew under the same disturbance
-    success: NDArray[np.bool_]  # [B], reached the horizon with all path constraints held
+    success: NDArray[np.bool_]  # [B], reached the horizon with all constraints held
     ms_per_control: Array  # [B], measured there; NaN where no control is computed
+    counted: NDArray[np.bool_] | None = None  # [B], not those from which no plan holds the constraints; None: all
 
     @property
     def lost(self) -> Array:
@@ -133,8 +138,10 @@ class ScenarioLoss:
         return np.where(np.isfinite(self.best), np.where(self.success, lost, np.inf), np.nan)
 
     def summary(self) -> Row:
-        return {"method": self.method, "how": self.how, "failures": int((~self.success).sum()),
-                "cost_median": percentile(self.cost, 50), "best_median": percentile(self.best, 50),
+        c = np.ones(len(self.cost), dtype=bool) if self.counted is None else self.counted
+        return {"method": self.method, "how": self.how, "failures": int((c & ~self.success).sum()),
+                "impossible": int((~c).sum()),
+                "cost_median": percentile(self.cost[c], 50), "best_median": percentile(self.best[c], 50),
                 "lost": quantiles(self.lost)}
 
 
@@ -162,10 +169,12 @@ class Robustness:
 
 @dataclass(frozen=True)
 class Promise:
-    """With `confidence`, at least `share` of the initial states end within `within` % of the best known cost."""
+    """With `confidence`, at least `share` of the initial states end within `within` % of the best known cost; without
+    `within`: get there with all constraints held.
+    """
 
     method: str
-    within: float  # per cent
+    within: float | None  # per cent
     confidence: float  # like 0.99
     n: int  # independent initial states
     successes: int
@@ -174,8 +183,10 @@ class Promise:
 
     def __str__(self) -> str:
         share = math.floor(1000 * self.share) / 10  # rounded down: it is a bound
+        what = "reach the horizon with all constraints held" if self.within is None else \
+            f"end within {self.within:g} % of the best known cost"
         return (f"{self.method}: with {100 * self.confidence:g} % confidence, at least {share:g} % of the {self.of} "
-                f"end within {self.within:g} % of the best known cost ({self.successes} of {self.n} did).")
+                f"{what} ({self.successes} of {self.n} did).")
 
 
 @dataclass(frozen=True, eq=False)

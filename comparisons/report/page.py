@@ -92,8 +92,9 @@ def _sections(report: Results, pictures: Mapping[str, Mapping[str, bytes]],
                                                      + made["stability"].html())
     if "regions" in made:
         yield "regions", made["regions"].title, REGIONS + image("regions") + made["regions"].html()
-    if "failures" in made:
-        yield "failures", made["failures"].title, made["failures"].html()
+    for name in ("failures", "impossible"):
+        if name in made:
+            yield name, made[name].title, made[name].html()
     yield "run", "What was run", _run(report, run)
 
 
@@ -153,13 +154,14 @@ def _run(report: Results, run: Mapping[str, Any]) -> str:
 EXPLORER = """<div class=controls><label>across <select id=across></select></label>
 <label>up <select id=up></select></label><label>colour <select id=colour></select></label></div>
 <figure><div id=map class="plot"></div><figcaption>Each point is an initial state. Click one to see its runs below;
-a cross failed or violates a path constraint.</figcaption></figure>
+a cross failed or violates a constraint, or no plan holds them from there.</figcaption></figure>
 <div id=panel><div class=controls><h3 id=which></h3><button id=previous aria-label="previous state">&lsaquo;</button>
 <label>state <input id=number type=number min=0 step=1></label><button id=next aria-label="next state">&rsaquo;</button>
 </div><div id=outcome class=scroll tabindex=0></div><div id=audit class=scroll tabindex=0></div>
 <label><input id=models type=checkbox> the same control on the learned model and under RK4</label>
 <figure><div id=runs class="plot"></div><figcaption>States and controls of every method on the exact dynamics. Grey
-dots: the goal; grey dashes: the bounds of a control.</figcaption></figure>
+dots: the goal; grey dashes: the bounds of a control; red dashes: constraints, those of more than one state or control
+by their values.</figcaption></figure>
 <div class=pair><figure><div id=along class="plot"></div><figcaption id=alongnote></figcaption></figure>
 <figure><div class=controls><label>across <select id=phasex></select></label>
 <label>up <select id=phasey></select></label></div><div id=phase class="plot"></div><figcaption>Phase portrait: the open

@@ -16,10 +16,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from nocl.comparisons.report import limits
 from nocl.comparisons.report.explain import explained_method
 from nocl.comparisons.report.findings import MethodAudit, Rollouts
 from nocl.comparisons.report.results import Judged, Results
-from nocl.comparisons.report.tables import AUDITED
+from nocl.comparisons.report.tables import AUDITED, failure
 from nocl.ocp import OCP
 from nocl.support.checks import Array
 
@@ -33,7 +34,7 @@ OUTLINE = 121  # points of the grid that an obstacle's edge is found on, in each
 MARGIN = 0.15  # of what runs visit, about a slice
 # numbers of a method and state, by the names that the page looks them up by
 NUMBERS: dict[str, Callable[[Judged], Array]] = {
-    "cost": lambda j: j.simulation.cost, "running": lambda j: j.simulation.running_cost,
+    "cost": lambda j: j.cost, "running": lambda j: j.simulation.running_cost,
     "terminal": lambda j: j.simulation.terminal_cost, "error": lambda j: j.simulation.terminal_error,
     "saturation": lambda j: j.simulation.saturation, "clearance": lambda j: j.simulation.clearance,
     "first": lambda j: j.ms_first, "later": lambda j: j.ms_per_control}
@@ -53,6 +54,10 @@ def payload(report: Results) -> dict[str, Any]:
             "best": [_index(report, i) for i in range(len(report.x0))],
             "methods": [_method(report, j, nodes, states) for j in report.judged],
             "kept": None if len(states) == len(report.x0) else states.tolist(),
+            "impossible": {str(i): report.impossible[i] for i in np.flatnonzero(~report.counted)},
+            "counted": int(report.counted.sum()), "lines": [list(line) for line in limits.lines(report.ocp)],
+            "held": [{"name": one.name, "bounds": [b for b in (one.low, one.high) if math.isfinite(b)]}
+                     for one in limits.others(report.ocp)],
             "plane": plane(report), "obstacles": obstacles(report), "slices": slices(report), **_study(report)}
 
 
@@ -85,9 +90,12 @@ def kept_states(report: Results) -> tuple[int, NDArray[np.integer[Any]]]:
 
 
 def channels(report: Results) -> dict[str, int]:
-    """Where in a run stands what follows its states and controls: the cost to go, and V where a method has one."""
-    after = len(report.ocp.system.names)
-    return {"togo": after} | ({} if valued(report) is None else {"V": after + 1})
+    """Where in a run stands what follows its states and controls: the cost to go, V where a method has one, and the
+    values of constraints, by name.
+    """
+    names = ["togo", *(["V"] if valued(report) is not None else []),
+             *(f"held {one.name}" for one in limits.others(report.ocp))]
+    return {name: k for k, name in enumerate(names, len(report.ocp.system.names))}
 
 
 def valued(report: Results) -> Judged | None:
@@ -109,8 +117,9 @@ def _method(report: Results, j: Judged, nodes: int, states: NDArray[np.integer[A
     if (owner := valued(report)) is not None:
         along = values_along(owner, s.t[index], s.x[states][:, index], report.parameters[states])
         run = np.concatenate([run, along[..., None]], axis=2)
+    run = np.concatenate([run, limits.values(report.ocp, s, report.parameters)[states][:, index]], axis=2)
     numbers = np.stack([read(j) for read in NUMBERS.values()], axis=1)
-    failed = {str(i): str(s.message[i]) for i in np.flatnonzero(~np.asarray(s.success, dtype=bool))}
+    failed = {str(i): failure(report, report.judged.index(j), i) for i in np.flatnonzero(~j.feasible)}
     return {"name": j.name, "how": j.how, "held": j.held, "t": s.t[index].tolist(), "failed": failed,
             "numbers": floats(numbers), **quantised(run)}
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from nocl.comparisons.report.findings import percentile
-from nocl.comparisons.report.results import NOTE, Results, count, percent, text_table
+from nocl.comparisons.report.results import Results, count, notes, percent, text_table
 from nocl.comparisons.report.verdict import verdict
 from nocl.support.checks import Array
 
@@ -45,7 +45,8 @@ class Report(Results):
         what = f"{self.ocp.system.name}, {count(len(self.x0), 'initial state')} {self.settings['initial states']}{each}"
         said = [textwrap.fill(sentence, WIDTH, subsequent_indent="  ") for sentence in self.verdict()]
         promised = [textwrap.fill(str(promise), WIDTH, subsequent_indent="  ") for promise in self.promises]
-        return "\n".join([what, "", str(self.summary()), "", *NOTE, "", *self._disturbed(), *promised, *said])
+        noted = [textwrap.fill(note, WIDTH, subsequent_indent="  ") for note in notes(self)]
+        return "\n".join([what, "", str(self.summary()), "", *noted, "", *self._disturbed(), *promised, *said])
 
     def _disturbed(self) -> list[str]:
         """Medians and 95th percentiles of what disturbances cost, as a table in plain text."""

@@ -29,7 +29,7 @@ from nocl.scales import usual_sizes
 from nocl.support.checks import Array
 
 REFERENCE = "reference"  # the name of a yardstick among the methods: its speed is no method's
-VIOLATION = 1e-3  # a constraint below minus this share of its own scale is violated
+NOISE = 1e-9  # of a cost: gains that are less are the judge's rounding
 WIDTH = 118  # characters of a line in the terminal
 Mask = NDArray[np.bool_]
 
@@ -61,14 +61,24 @@ class Judged:
     @property
     def feasible(self) -> Mask:
         """[B], whether the run reached the horizon with all constraints held."""
-        return np.asarray(self.simulation.success, dtype=bool) & ~(self.simulation.violation > VIOLATION)
+        return np.asarray(self.simulation.success, dtype=bool)
+
+    @property
+    def violates(self) -> Mask:
+        """[B], whether it got there and did not hold them."""
+        return np.asarray(self.simulation.reached, dtype=bool) & ~self.feasible
+
+    @property
+    def cost(self) -> Array:
+        """[B], inf where the run failed."""
+        return np.where(self.feasible, self.simulation.cost, np.inf)
 
 
 class Summary(list[Row]):
     """One dict a method; printed as a table."""
 
     def __str__(self) -> str:
-        return text_table([label for label, _, _ in COLUMNS], [cells(row) for row in self])
+        return text_table([label for label, _, _ in columns(self)], [cells(row, columns(self)) for row in self])
 
     __repr__ = __str__
 
@@ -91,16 +101,23 @@ class Results:
     promises: tuple[Promise, ...] = ()  # one a method, where the states are independent draws
     stability: tuple[Stability, ...] = ()
     regions: tuple[Region, ...] = ()
+    base: Array | None = None  # [B], the least cost of simple baselines, NaN where none is feasible
+    impossible: tuple[str, ...] = ()  # [B], why no plan holds the constraints from a state; "", or (): not said
 
     def rows(self) -> list[Row]:
-        """One dict a method and initial state; a run that failed has success False, its message, and infinite cost."""
+        """One dict a method and initial state; a run that failed has success False, its message, and infinite cost.
+
+        One that reached the horizon and violated a constraint has failed: `reached` tells the two apart.
+        """
         audits = {audit.method: audit.rows() for audit in self.audits}
         keys = list(dict.fromkeys(key for rows in audits.values() for key in rows[0]))
         return [self._row(m, i) | dict.fromkeys(keys, math.nan) | (audits[j.name][i] if j.name in audits else {})
                 for m, j in enumerate(self.judged) for i in range(len(self.x0))]
 
     def summary(self) -> Summary:
-        """One dict a method. Means are over the runs that did not fail; medians, percentiles and shares over all."""
+        """One dict a method. Means are over the runs that did not fail; medians, percentiles and shares over all states
+        that count: not those from which no plan holds the constraints.
+        """
         return Summary(self._summarize(m) for m in range(len(self.judged)))
 
     @property
@@ -125,7 +142,7 @@ class Results:
     @cached_property
     def cost(self) -> Array:
         """[methods, B] judged costs, inf where a run failed."""
-        return np.array([j.simulation.cost for j in self.judged])
+        return np.array([j.cost for j in self.judged])
 
     @cached_property
     def feasible(self) -> Mask:
@@ -135,27 +152,64 @@ class Results:
     @cached_property
     def best(self) -> Array:
         """[B], the least judged cost of a run that violated nothing; NaN where there is none."""
-        least = np.where(self.feasible, self.cost, np.inf).min(axis=0)
+        least = self.cost.min(axis=0)
         return np.where(np.isfinite(least), least, np.nan)
+
+    @cached_property
+    def counted(self) -> Mask:
+        """[B], the states that rows are about: not those from which no plan holds the constraints, as a solver says,
+        and nobody did better.
+        """
+        said = np.array([bool(why) for why in self.impossible or [""] * len(self.x0)], dtype=bool)
+        return np.asarray(~said | self.feasible.any(axis=0))
 
     @cached_property
     def best_method(self) -> list[str]:
         """[B], who found it ("" where nobody did); the first named where two are equal."""
-        who = np.where(self.feasible, self.cost, np.inf).argmin(axis=0)
+        who = self.cost.argmin(axis=0)
         return [self.judged[m].name if math.isfinite(b) else "" for m, b in zip(who, self.best, strict=True)]
 
     @cached_property
     def gap(self) -> Array:
-        """[methods, B], cost - best in per cent of |best|; inf where a run failed or nobody has a best."""
+        """[methods, B], cost - best in per cent of |best|; inf where a run failed or nobody has a best, NaN where the
+        state does not count.
+        """
         gap = per_cent(self.cost - self.best, self.best, usual_sizes(self.ocp).cost)
-        return np.where(np.isnan(gap), np.inf, gap)
+        return np.where(self.counted, np.where(np.isnan(gap), np.inf, gap), np.nan)
 
-    def violated(self, m: int, i: int) -> str:
-        """By how much a run violates a constraint, in words."""
-        s = self.judged[m].simulation
-        if self.ocp.in_scales:
-            return f"violates a constraint by {number(100 * float(s.violation[i]))} % of its scale"
-        return f"violates a path constraint by {number(-float(s.clearance[i]))}"
+    @cached_property
+    def gainful(self) -> Mask:
+        """[B], where a simple baseline is known that costs more than the best known run."""
+        if self.base is None:
+            return np.zeros(len(self.x0), dtype=bool)
+        with np.errstate(invalid="ignore"):
+            return np.asarray(self.base - self.best > NOISE * (np.abs(self.base) + np.abs(self.best)))
+
+    @cached_property
+    def missed(self) -> Array:
+        """[methods, B], cost - best in per cent of base - best, of what can be gained over simple baselines.
+
+        inf where a run failed, NaN where nothing can be gained, no baseline is feasible, or the state does not count.
+        """
+        base = np.full(len(self.x0), np.nan) if self.base is None else self.base
+        room = np.where(self.gainful, base - self.best, np.nan)
+        with np.errstate(invalid="ignore"):
+            missed = 100 * (self.cost - self.best) / room
+        return np.where(self.counted & self.gainful, missed, np.nan)
+
+    def violations(self, m: int) -> str:
+        """Which constraints a method violates, by how much at most, on how many states that count, in words."""
+        j, worst = self.judged[m], dict[str, list[int]]()
+        for i in np.flatnonzero(j.violates & self.counted):
+            name, _ = self.ocp.excess(int(j.simulation.worst[i]), float(j.simulation.violation[i]))
+            worst.setdefault(name, []).append(int(i))
+        return ", ".join(self._violation(j, name, states) for name, states in worst.items())
+
+    def _violation(self, judged: Judged, name: str, states: Sequence[int]) -> str:
+        s = judged.simulation
+        i = max(states, key=lambda state: s.violation[state])
+        _, much = self.ocp.excess(int(s.worst[i]), float(s.violation[i]))
+        return f"{name!r} by {much} ({len(states)} of {self.counted.sum()})"
 
     def within(self, percent: float) -> Mask:
         """[methods, B], whether a run violates nothing and is within so much of the best known cost."""
@@ -165,33 +219,38 @@ class Results:
         j, s = self.judged[m], self.judged[m].simulation
         p = {"p": self.parameters[i].tolist()} if self.ocp.np else {}
         return {"method": j.name, "state": i, "x0": self.x0[i].tolist(), **p, "success": bool(s.success[i]),
-                "feasible": bool(self.feasible[m, i]), "message": s.message[i], "cost": float(s.cost[i]),
+                "feasible": bool(self.feasible[m, i]), "message": s.message[i], "cost": float(self.cost[m, i]),
                 "gap": float(self.gap[m, i]), "best_cost": float(self.best[i]), "best_method": self.best_method[i],
+                "missed": float(self.missed[m, i]), "base_cost": math.nan if self.base is None else float(self.base[i]),
                 "predicted_cost": float(j.predicted[i]), "running_cost": float(s.running_cost[i]),
                 "terminal_cost": float(s.terminal_cost[i]), "terminal_error": float(s.terminal_error[i]),
                 "x_end": s.x[i, -1].tolist(), "error": self.ocp.from_goal(s.x[i, -1], self.parameters[i]).tolist(),
                 "control_magnitude": float(s.control_magnitude[i]),
                 "saturation": float(s.saturation[i]), "clearance": float(s.clearance[i]),
+                "reached": bool(s.reached[i]), "violation": float(s.violation[i]), "counted": bool(self.counted[i]),
                 "ms_first": float(j.ms_first[i]), "solves": int(j.solves[i]),
                 "ms_per_control": float(j.ms_per_control[i]), "evaluations": float(j.evaluations[i])}
 
     def _summarize(self, m: int) -> Row:
-        j, s, gap = self.judged[m], self.judged[m].simulation, self.gap[m]
-        ok = np.asarray(s.success, dtype=bool)
-        return {"method": j.name, "how": j.how, "n": len(self.x0), "failures": int((~ok).sum()),
-                "violations": int((ok & ~self.feasible[m]).sum()),
-                "cost_mean": mean(s.cost[ok]), "cost_median": float(np.median(s.cost)),
+        j, s, c = self.judged[m], self.judged[m].simulation, self.counted
+        ok, gap, missed = self.feasible[m], self.gap[m, c], self.missed[m, c & self.gainful]
+        return {"method": j.name, "how": j.how, "n": int(c.sum()), "failures": int((c & ~ok).sum()),
+                "violations": int((c & j.violates).sum()), "violates": self.violations(m),
+                "impossible": int((~c).sum()),
+                "cost_mean": mean(s.cost[ok]),
+                "cost_median": float(np.median(self.cost[m, c])) if c.any() else math.nan,
                 "predicted_mean": mean(j.predicted[ok]),
                 "gap_median": percentile(gap, 50), "gap_p95": percentile(gap, 95),
-                "within_1": 100 * float(self.within(1).mean(axis=1)[m]),
-                "within_5": 100 * float(self.within(5).mean(axis=1)[m]),
+                "missed_median": percentile(missed, 50), "missed_p95": percentile(missed, 95),
+                "missed_n": len(missed),
+                "within_1": 100 * mean(self.within(1)[m, c]), "within_5": 100 * mean(self.within(5)[m, c]),
                 "found_best": self.best_method.count(j.name),
                 "terminal_error_mean": mean(s.terminal_error[ok]),
                 "terminal_error_sd": float(s.terminal_error[ok].std()) if ok.any() else math.nan,
                 "control_magnitude": mean(s.control_magnitude[ok]), "saturation": mean(s.saturation[ok]),
-                "clearance_min": float(np.min(s.clearance[ok], initial=math.inf)),
-                "ms_first": mean(j.ms_first), "solves": mean(j.solves), "ms_per_solve": mean(_each_answer(j)),
-                "ms_per_control": mean(j.ms_per_control)}
+                "clearance_min": float(np.min(s.clearance[c & s.reached], initial=math.inf)),
+                "ms_first": mean(j.ms_first[c]), "solves": mean(j.solves[c]), "ms_per_solve": mean(_each_answer(j)[c]),
+                "ms_per_control": mean(j.ms_per_control[c])}
 
 
 def _each_answer(judged: Judged) -> Array:
@@ -211,6 +270,7 @@ COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("method", "method", "text"), ("failed", "failures", "count"), ("mean cost", "cost_mean", "number"),
     ("predicted", "predicted_mean", "number"),
     ("median gap %", "gap_median", "percent"), ("p95 gap %", "gap_p95", "percent"),
+    ("missed %", "missed_median", "known"),
     ("within 1 %", "within_1", "share"), ("within 5 %", "within_5", "share"),
     ("terminal error", "terminal_error", "spread"), ("mean |u|", "control_magnitude", "number"),
     ("ms", "ms_per_solve", "number"),
@@ -219,11 +279,34 @@ NOTE = (
     "Judged on the exact f under CVODES. Gap: to the best known cost of the same initial state, over all methods here.",
     "ms: one evaluation of a controller, or one solve; a solver that tried several starts took so many solves a state.",
     "Mean costs, error and |u| are over the runs that did not fail; predicted is what the method itself expected.")
+VIOLATES = ("violates", "violates", "text")  # the column that stands where there is something in it
 
 
-def cells(row: Row) -> list[str]:
+def columns(rows: Sequence[Row]) -> tuple[tuple[str, str, str], ...]:
+    """Of a table of summary rows."""
+    told = any(row["violates"] for row in rows)
+    return (*COLUMNS[:2], VIOLATES, *COLUMNS[2:]) if told else COLUMNS
+
+
+def cells(row: Row, of: Sequence[tuple[str, str, str]] = COLUMNS) -> list[str]:
     """A summary row as text, one cell a column."""
-    return [_cell(row, key, form) for _, key, form in COLUMNS]
+    return [_cell(row, key, form) for _, key, form in of]
+
+
+def notes(report: Results) -> list[str]:
+    """What the numbers of the summary are, in sentences."""
+    n, c = int(report.counted.sum()), report.counted
+    if report.base is None:
+        return [*NOTE]
+    known = int((c & np.isfinite(report.base)).sum())
+    said = ["Missed: the excess over the best known cost, in per cent of what can be gained over simple baselines (a "
+            "control that is held, at u*, at the middle of U or at 0, and LQR's); median."]
+    if known < n:
+        said.append(f"From {n - known} of {count(n, 'state')} no such baseline reaches the horizon and holds all "
+                    "constraints: there the gap to the best known cost alone is given.")
+    if beaten := known - int((c & report.gainful & np.isfinite(report.base)).sum()):
+        said.append(f"On {beaten} of {count(n, 'state')} nothing is missed: no method costs less than such a baseline.")
+    return [*NOTE, *said]
 
 
 def _cell(row: Row, key: str, form: str) -> str:
@@ -234,6 +317,8 @@ def _cell(row: Row, key: str, form: str) -> str:
             return f"{row[key]:.0f} %" if row[key] in (0, 100) else f"{row[key]:.1f} %"
         case "percent":
             return percent(row[key])
+        case "known":
+            return "-" if math.isnan(row[key]) else percent(row[key])
         case "spread":
             return f"{number(row[key + '_mean'])} ± {number(row[key + '_sd'])}"
     return number(row[key])

@@ -9,6 +9,7 @@ import matplotlib
 from matplotlib.figure import Figure
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")  # Okabe, Ito: safe for all eyes
+LIMIT = "#b2182b"  # of constraints
 DASHES = ("-", "--", "-.", ":")
 STYLE: dict[Any, Any] = {"svg.fonttype": "path", "svg.hashsalt": "nocl", "font.size": 9, "axes.spines.top": False,
          "axes.spines.right": False, "axes.grid": True, "grid.alpha": 0.25, "legend.frameon": False}

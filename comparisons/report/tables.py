@@ -13,7 +13,7 @@ import numpy as np
 
 from nocl.comparisons.report.explain import worst_states
 from nocl.comparisons.report.findings import quantiles
-from nocl.comparisons.report.results import COLUMNS, NOTE, Results, cells, number, percent
+from nocl.comparisons.report.results import Results, cells, columns, notes, number, percent
 from nocl.support.checks import Array
 
 WORST = 5
@@ -73,18 +73,19 @@ def tables(report: Results) -> dict[str, Table]:
     made: dict[str, Callable[[Results], Table]] = {
         "summary": summary, "errors": errors, "worst": worst, "timings": timings, "audits": audits,
         "robustness": robustness, "promises": promises, "stability": stability, "regions": regions,
-        "failures": failures}
+        "failures": failures, "impossible": impossible}
     found = {name: make(report) for name, make in made.items()}
     return {name: table for name, table in found.items() if table.body}
 
 
 NAMES = ("summary", "errors", "worst", "timings", "audits", "robustness", "promises", "stability", "regions",
-         "failures")  # the names that `tables` may use
+         "failures", "impossible")  # the names that `tables` may use
 
 
 def summary(report: Results) -> Table:
-    return Table("Summary", [label for label, _, _ in COLUMNS], [cells(row) for row in report.summary()],
-                 " ".join(NOTE))
+    rows = report.summary()
+    of = columns(rows)
+    return Table("Summary", [label for label, _, _ in of], [cells(row, of) for row in rows], " ".join(notes(report)))
 
 
 def errors(report: Results) -> Table:
@@ -120,10 +121,14 @@ def x0_text(report: Results, i: int) -> str:
 def run_cell(report: Results, m: int, i: int) -> str:
     s = report.judged[m].simulation
     if not s.success[i]:
-        return f"failed: {s.message[i]}"
-    if not report.feasible[m, i]:
-        return f"{number(report.cost[m, i])}, {report.violated(m, i)}"
+        return failure(report, m, i)
     return f"{number(report.cost[m, i])} ({percent(report.gap[m, i])} %)"
+
+
+def failure(report: Results, m: int, i: int) -> str:
+    """Why a run that failed did, in words."""
+    s = report.judged[m].simulation
+    return str(s.message[i]) if s.reached[i] else f"failed: {s.message[i]}"
 
 
 def timings(report: Results) -> Table:
@@ -175,11 +180,11 @@ def robustness(report: Results) -> Table:
 
 
 def promises(report: Results) -> Table:
-    body = [[p.method, f"{p.within:g} %", f"{p.successes} of {p.n}", f"{100 * p.confidence:g} %",
-             f"{math.floor(1000 * p.share) / 10:g} %"] for p in report.promises]
+    body = [[p.method, "constraints held" if p.within is None else f"{p.within:g} %", f"{p.successes} of {p.n}",
+             f"{100 * p.confidence:g} %", f"{math.floor(1000 * p.share) / 10:g} %"] for p in report.promises]
     return Table("What can be promised", ["method", "within", "seen", "confidence", "at least"], body,
                  "Exact lower bound (Clopper and Pearson 1934) of the share of initial states, drawn as these were, "
-                 "that end within so much of the best known cost.")
+                 "that end within so much of the best known cost, or with all constraints held.")
 
 
 def stability(report: Results) -> Table:
@@ -198,10 +203,17 @@ def regions(report: Results) -> Table:
 
 
 def failures(report: Results) -> Table:
-    """All failures with their messages."""
+    """All failures with their messages, from states that count."""
     body = [[j.name, str(i), str(j.simulation.message[i])] for j in report.judged for i in range(len(report.x0))
-            if not j.simulation.success[i]]
+            if report.counted[i] and not j.simulation.success[i]]
     return Table("What failed", ["method", "state", "message"], body, text=True)
+
+
+def impossible(report: Results) -> Table:
+    """The states that do not count, and why."""
+    body = [[str(i), x0_text(report, i), report.impossible[i]] for i in np.flatnonzero(~report.counted).tolist()]
+    return Table("Left out: no plan holds the constraints", ["state", "x0", "why"], body,
+                 "By DDP, from cold starts and from what the methods did: the word of a local solver.", text=True)
 
 
 def facts(pairs: Iterable[tuple[str, object]]) -> Table:

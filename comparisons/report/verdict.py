@@ -24,22 +24,32 @@ UNSTABLE = 0.05  # a plan that costs more than predicted by this share, in the m
 
 def verdict(report: Results) -> list[str]:
     """Who is how near to the best known cost; how fast; what failed."""
-    summary = report.summary()
-    n = len(report.x0)
+    summary, n = report.summary(), int(report.counted.sum())
     open_loop = [said for j in report.judged for said in _without_feedback(j)]
-    what = "constraint" if report.ocp.in_scales else "path constraint"
-    return [_near(report, summary), *_manners(summary), *open_loop, *_speed(summary), *_failures(summary, n, what)]
+    return [*_near(report, summary), *_left_out(report), *_manners(summary), *open_loop, *_speed(summary),
+            *_failures(summary, n)]
 
 
-def _near(report: Results, summary: Sequence[Row]) -> str:
+def _near(report: Results, summary: Sequence[Row]) -> list[str]:
     """Who is within 5 % of the best known cost; a method with all the answers is the best known by itself."""
-    n, answers = len(report.x0), report.feasible.sum(axis=1)
+    n, answers = int(report.counted.sum()), report.feasible.sum(axis=1)
+    if not n:
+        return []
     if np.count_nonzero(answers) == 1:
         m = int(answers.argmax())
-        return (f"Only {summary[m]['method']} has answers that count, on {_share(100 * answers[m] / n, n)} initial "
-                "states: there is nothing to compare its cost with.")
+        return [f"Only {summary[m]['method']} has answers that count, on {_share(100 * answers[m] / n, n)} initial "
+                "states: there is nothing to compare its cost with."]
     near = [f"{row['method']} on {_share(row['within_5'], n)}{_gap_text(row)}" for row in summary]
-    return f"Within 5 % of the best known cost of {count(n, 'initial state')}: " + ", ".join(near) + "."
+    return [f"Within 5 % of the best known cost of {count(n, 'initial state')}: " + ", ".join(near) + "."]
+
+
+def _left_out(report: Results) -> list[str]:
+    """States from which no plan holds the constraints, the first of them with the reason."""
+    out = np.flatnonzero(~report.counted)
+    if not out.size:
+        return []
+    return [f"Left out of all numbers: {len(out)} of {count(len(report.x0), 'initial state')}, from which no plan was "
+            f"found that holds the constraints (state {out[0]}: {report.impossible[out[0]]})."]
 
 
 def _without_feedback(judged: Judged) -> list[str]:
@@ -87,9 +97,11 @@ def _speed(summary: Sequence[Row]) -> list[str]:
             f"{number(slow['ms_per_solve'])} ms: {times} times faster."]
 
 
-def _failures(summary: Sequence[Row], n: int, what: str) -> list[str]:
-    parts = [f"{row['method']} failed on {row['failures']} of {n}" for row in summary if row["failures"]]
-    parts += [f"{row['method']} violates a {what} on {row['violations']} of {n}" for row in summary
-              if row["violations"]]
-    return ["; ".join(parts) + "."] if parts else [f"No run failed, and no {what} was violated."
-                                                   if math.isfinite(summary[0]["clearance_min"]) else "No run failed."]
+def _failures(summary: Sequence[Row], n: int) -> list[str]:
+    stopped = {row["method"]: row["failures"] - row["violations"] for row in summary}
+    parts = [f"{method} failed on {k} of {n}" for method, k in stopped.items() if k]
+    parts += [f"{row['method']} violates {row['violates']}" for row in summary if row["violates"]]
+    if parts:
+        return ["; ".join(parts) + "."]
+    held = any(math.isfinite(row["clearance_min"]) for row in summary)
+    return (["No run failed, and no constraint was violated." if held else "No run failed."]) if n else []

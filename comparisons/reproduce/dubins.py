@@ -88,14 +88,14 @@ def judged(ocp: OCP, controller: Any, x0: Array) -> tuple[Simulation, Array]:
     if isinstance(controller, np.ndarray):
         bad = ~np.isfinite(controller).all(axis=(1, 2))
         s = simulate(ocp, np.where(np.isfinite(controller), controller, 0.0), x0)
-        s.success[bad], s.cost[bad], s.x[bad] = False, np.inf, np.nan
+        s.success[bad], s.reached[bad], s.cost[bad], s.x[bad] = False, False, np.inf, np.nan
     else:
         s = simulate(ocp, controller, x0, nodes=NODES) if hasattr(controller, "to_casadi") else \
             simulate(ocp, controller, x0, hold=INTERVALS)
     h = np.diff(s.t)
     continuous = hasattr(controller, "to_casadi")
     v = (s.u[:, :-1, 0] + s.u[:, 1:, 0]) / 2 if continuous else s.u[:, :-1, 0]
-    return s, np.where(s.success, v @ h, np.inf)
+    return s, np.where(s.reached, v @ h, np.inf)
 
 
 def rollout_ms(ocp: OCP, controller: Callable[[Array, float], Array], x0: Array) -> float:
@@ -270,7 +270,7 @@ class Dubins(table.PaperTable[Plan, Cell, Entry]):
         s, length = judged(ocp, controller, x0)
         turned = s.x[:, -1] - ocp.x_goal
         turned[:, 2] = (turned[:, 2] + math.pi) % (2 * math.pi) - math.pi
-        error = np.where(s.success, np.linalg.norm(turned, axis=1), np.inf)
+        error = np.where(s.reached, np.linalg.norm(turned, axis=1), np.inf)
         return Cell(place.way, place.seed, self.key(plan, place), ms, made, length.tolist(), error.tolist(),
                     s.clearance.tolist(), s.cost.tolist(), np.round(s.x[:DRAWN, :, :2], 3).tolist())
 

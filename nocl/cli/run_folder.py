@@ -273,7 +273,8 @@ def solve(ocp: OCP, out: Path, name: str, n: int, options: registry.Options, wor
         arrays["p"], facts["parameters"] = starts.p, list(ocp.parameter_names)
     if at:
         facts["p"] = dict(at)
-    path = _write_arrays(out / f"{name}.npz", {"x0": starts.x, **arrays, **judged})
+    path = _write_arrays(out / f"{name}.npz", {"x0": starts.x, **arrays, **{key: judged[key] for key in judged
+                                                                             if key != "message"}})
     store.write_json(out / f"{name}.json", {"solver": name, "n": n, "seed": fresh_seed(seed), **facts,
                                             "message": list(s.message)})
     _forget(checkpoint)
@@ -284,16 +285,24 @@ def solve(ocp: OCP, out: Path, name: str, n: int, options: registry.Options, wor
     if not ok.any():
         raise ValueError(f"{name} {'solved' if planned else 'simulated'} none of {count(n, 'initial state')}; of the "
                          f"first: {s.message[0]}")
+    if judged and not (judged["judged_success"] | (ok & np.isnan(judged["judged_cost"]))).any():
+        raise ValueError(f"none of {name}'s plans gets to the horizon with all constraints held on the exact f; the "
+                         f"first {judged['message'][0]}: expected plans that hold them between their nodes too, give "
+                         "more --intervals, or tighter bounds")
 
 
 def _judged(ocp: OCP, starts: Starts, arrays: dict[str, Any]) -> dict[str, Any]:
-    """Cost and clearance of plans on the exact f, of the first JUDGED that were solved; NaN of the others."""
+    """Cost and clearance of plans on the exact f, of the first JUDGED that were solved, and whether they hold the
+    constraints there; NaN and False of the others. `message` is of those that do not.
+    """
     rows, n = np.flatnonzero(arrays["success"])[:JUDGED], len(starts)
-    cost, clearance = np.full(n, np.nan), np.full(n, np.nan)
+    cost, clearance, success = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, dtype=bool)
+    message: list[str] = []
     if len(rows):
         s = simulate(ocp, arrays["u"][rows], starts.x[rows], p=starts.p[rows])
-        cost[rows], clearance[rows] = s.cost, s.clearance
-    return {"judged_cost": cost, "judged_clearance": clearance}
+        cost[rows], clearance[rows], success[rows] = s.cost, s.clearance, s.success
+        message = [f"{why} (state {i})" for i, why in zip(rows, s.message, strict=True) if why]
+    return {"judged_cost": cost, "judged_clearance": clearance, "judged_success": success, "message": message}
 
 
 def _verdict(ocp: OCP, arrays: dict[str, Any], judged: dict[str, Any], message: Sequence[str]) -> str:
@@ -302,9 +311,15 @@ def _verdict(ocp: OCP, arrays: dict[str, Any], judged: dict[str, Any], message: 
     rows = np.flatnonzero(~np.isnan(judged.get("judged_cost", np.zeros(0))))
     if len(rows):
         cost, clear = judged["judged_cost"][rows], judged["judged_clearance"][rows]
+        held = judged["judged_success"][rows]
+        mean, predicted = (f"{values[held].mean():.4g}" if held.any() else "-"
+                           for values in (cost, arrays["cost"][rows]))
         clearance = f"; least clearance {clear.min():.3g}" if ocp.constraint_names else ""
-        said.append(f"judged in open loop on the exact f, {count(len(rows), 'plan')}: mean cost {cost.mean():.4g}, "
-                    f"predicted {arrays['cost'][rows].mean():.4g}{clearance}")
+        said.append(f"judged in open loop on the exact f, {count(len(rows), 'plan')}: mean cost {mean}, "
+                    f"predicted {predicted}{clearance}")
+        if judged["message"]:
+            said.append(f"{len(judged['message'])} of {len(rows)} failed there and count in no mean: the first "
+                        f"{judged['message'][0]}")
         most = COARSE * np.abs(arrays["cost"][rows]) + TINY * usual_sizes(ocp).cost
         off = np.abs(cost - arrays["cost"][rows]) > most
         if off.any():

@@ -116,7 +116,7 @@ def to_gymnasium(ocp: OCP, *, steps: int = 80, integrator: str = "rk4", observe_
         raise ValueError(f"to_gymnasium: steps is {steps!r}; expected an integer >= 1")
     if integrator not in ("rk4", "cvodes"):
         raise ValueError(f"to_gymnasium: integrator is {integrator!r}; expected 'rk4' or 'cvodes'")
-    ocp.refuse_constraints("to_gymnasium")
+    ocp.refuse_constraints("to_gymnasium", "put a penalty for them into the running cost, which the reward is made of")
     gymnasium = package("gymnasium")
     step = _step(ocp, ocp.horizon / steps, integrator)
     return _environment(gymnasium, ocp, int(steps), step, observe_time)

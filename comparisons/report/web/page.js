@@ -117,7 +117,7 @@ function outcome(m) {
   const method = D.methods[m], failed = method.failed[state], cells = ["cost", "running", "terminal", "error"].map((name) => text(number(m, state, name)));
   const clearance = number(m, state, "clearance");
   return [`<span class=swatch style="border-color:${colour(m)}"></span>${MNAMES[m]}`,
-          failed !== undefined ? "failed: " + safe(failed) : D.feasible[m][state] ? "+" + percent(gap(m, state)) : "violates a path constraint",
+          failed !== undefined ? safe(failed) : "+" + percent(gap(m, state)),
           ...cells, `${(100 * number(m, state, "saturation")).toFixed(0)} %`, ...(Number.isFinite(clearance) || hasPath ? [text(clearance)] : []),
           text(number(m, state, "first")), text(number(m, state, "later"))];
 }
@@ -135,11 +135,12 @@ function drawOutcome() {
   }).join("");
   const start = [...D.states.map((name, k) => [name, k]), ...PARAMETERS.map((name, k) => [name, nx + nu + k])]
     .map(([name, k]) => `${name} ${text(x0(state, k))}`).join(", ");
-  $("which").textContent = `State ${state}: ${start}` + (D.best[state] >= 0 ? `. Best known by ${D.methods[D.best[state]].name}` : "");
+  const why = D.impossible[state];
+  $("which").textContent = `State ${state}: ${start}` + (why ? `. Left out: ${why}` : D.best[state] >= 0 ? `. Best known by ${D.methods[D.best[state]].name}` : "");
   $("number").value = state;
 }
 function drawRuns() {
-  const n = nx + nu, width = $("runs").clientWidth || 900;
+  const n = nx + nu + D.held.length, width = $("runs").clientWidth || 900;
   const columns = Math.min(n, width < 520 ? 1 : width < 900 || n < 6 ? 2 : n < 10 ? 3 : 4), rows = Math.ceil(n / columns);
   const traces = [], extra = {annotations: [], shapes: [], height: 72 + rows * 172, margin: {l: 36, r: 8, t: 48, b: 24}};
   const kept = D.methods.map((_, m) => run(m, state));
@@ -149,20 +150,25 @@ function drawRuns() {
     const top = 1 - row * h - 20 / (extra.height - 72), bottom = 1 - (row + 1) * h + 24 / (extra.height - 72);
     extra["xaxis" + id] = axis({domain: [left, left + w], anchor: "y" + id, range: [0, D.horizon], automargin: false, nticks: 6});
     extra["yaxis" + id] = axis({domain: [bottom, top], anchor: "x" + id, automargin: false, nticks: 5});
-    extra.annotations.push({text: LABELS[k], x: left, y: top, xref: "paper", yref: "paper", xanchor: "left", yanchor: "bottom",
+    const held = D.held[k - nx - nu], c = held ? D.channels["held " + held.name] : k;  // of more than one state: its own values
+    extra.annotations.push({text: held ? safe(held.name) : LABELS[k], x: left, y: top, xref: "paper", yref: "paper", xanchor: "left", yanchor: "bottom",
                             showarrow: false, font: {size: 12, color: css("--quiet")}});
     const across = (y, dash) => extra.shapes.push({type: "line", xref: "x" + id, yref: "y" + id, x0: 0, x1: D.horizon, y0: y, y1: y,
                                                    layer: "below", line: {color: css("--quiet"), width: 1, dash}});
-    across(goal(k), "dot");
-    const values = kept.flatMap((r) => r ? r[k].filter((v) => v !== null) : []);
-    if (k >= nx && values.length) {
+    if (!held) across(goal(k), "dot");
+    const values = kept.flatMap((r) => r ? r[c].filter((v) => v !== null) : []), low = Math.min(...values), high = Math.max(...values);
+    const bounds = held ? held.bounds.map((y) => [y, false]) : D.lines.filter((l) => l[0] === k).map((l) => [l[1], l[2]]);
+    bounds.filter(([y]) => y >= 2 * low - high && y <= 2 * high - low).forEach(([y, last]) => traces.push({type: "scatter", mode: "lines",
+      x: [last ? 0.94 * D.horizon : 0, D.horizon], y: [y, y], xaxis: "x" + id, yaxis: "y" + id, showlegend: false, hoverinfo: "skip",
+      line: {color: css("--limit"), width: 1.5, dash: last ? "solid" : "dash"}}));
+    if (k >= nx && !held && values.length) {
       const low = D.lbu[k - nx], high = D.ubu[k - nx], room = 0.02 * (high - low);
       if (Math.min(...values) <= low + room) across(low, "dash");
       if (Math.max(...values) >= high - room) across(high, "dash");
     }
-    kept.forEach((r, m) => r && traces.push({type: "scatter", mode: "lines", x: D.methods[m].t, y: r[k], xaxis: "x" + id, yaxis: "y" + id,
+    kept.forEach((r, m) => r && traces.push({type: "scatter", mode: "lines", x: D.methods[m].t, y: r[c], xaxis: "x" + id, yaxis: "y" + id,
       name: MNAMES[m], legendgroup: String(m), showlegend: k === 0, hovertemplate: `${MNAMES[m]}: %{y:.4g}<extra>t = %{x:.3g}</extra>`,
-      line: line(m, k >= nx && D.methods[m].held ? {shape: "hv"} : {})}));
+      line: line(m, k >= nx && !held && D.methods[m].held ? {shape: "hv"} : {})}));
   }
   if ($("models").checked) AUDITS.forEach((audit) => audit.rollouts.forEach((rollout, c) => {
     const r = unpacked(rollout, state, B), m = D.methods.findIndex((method) => method.name === audit.method);
@@ -232,7 +238,7 @@ function drawEcdf() {
   const traces = D.methods.map((_, m) => {
     const known = Array.from({length: B}, (_, i) => i).filter((i) => ok(m, i)).map((i) => Math.max(gap(m, i), FLOOR)).sort((a, b) => a - b);
     const right = 1e3, x = [FLOOR, ...known, Math.max(right, known.length ? known[known.length - 1] : 0)];
-    const y = [0, ...known.map((_, k) => 100 * (k + 1) / B), 100 * known.length / B];
+    const y = [0, ...known.map((_, k) => 100 * (k + 1) / D.counted), 100 * known.length / D.counted];
     return {type: "scatter", mode: "lines", name: MNAMES[m], x, y, line: line(m, {shape: "hv"}),
             hovertemplate: `${MNAMES[m]}: %{y:.1f} % of the states within %{x:.3g} %<extra></extra>`};
   });
