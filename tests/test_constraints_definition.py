@@ -219,8 +219,6 @@ SAID = {"of u": "constraint 'push' of the control", "equation": "constraint 'tie
 TAKERS = {"DDP with constraints='soft'": lambda ocp: DDP(ocp, constraints="soft"), "LQR": LQR, "train": nocl.train,
           "LevelSet": lambda ocp: LevelSet(ocp, [9, 9]),
           "train_neural_oc": train_neural_oc, "to_gymnasium": nocl.to_gymnasium, "minimiser": minimiser,
-          "study": lambda ocp: study(ocp, {}), "region": lambda ocp: region(ocp, "none", lambda x, t: x[:, :1]),
-          "Reference": lambda ocp: Reference(ocp, 80),
           "NMPC with gains": lambda ocp: NMPC(ocp, 4).solve([1.0, 0.0], gains=True),
           "NMPC with constraints='soft'": lambda ocp: NMPC(ocp, 4, constraints="soft")}
 
@@ -228,8 +226,16 @@ TAKERS = {"DDP with constraints='soft'": lambda ocp: DDP(ocp, constraints="soft"
 @pytest.mark.parametrize("kind", BEYOND)
 @pytest.mark.parametrize("taker", TAKERS)
 def test_who_takes_no_such_thing_says_so(taker, kind):
-    with pytest.raises(ValueError, match=f"^{taker} takes .*{SAID[kind]}.*(NMPC|gains)"):
+    with pytest.raises(ValueError, match=f"^{taker} takes .*{SAID[kind]}.*(NMPC|gains|penalty)"):
         TAKERS[taker](make(**BEYOND[kind]))
+
+
+@pytest.mark.parametrize(("taker", "take"), [
+    ("study", lambda ocp: study(ocp, {})), ("Reference", lambda ocp: Reference(ocp, 80)),
+    ("region", lambda ocp: region(ocp, "none", lambda x, t: x[:, :1]))])
+def test_what_takes_constraints_takes_no_free_horizon(taker, take):
+    with pytest.raises(ValueError, match=rf"^{taker} takes .*{SAID['free']}"):
+        take(make(**BEYOND["free"]))
 
 
 def test_constraints_are_left_out_by_name():

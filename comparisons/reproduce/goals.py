@@ -20,6 +20,7 @@ import numpy as np
 
 import nocl
 from nocl.comparisons.comparison import compare
+from nocl.comparisons.report.results import Judged
 from nocl.comparisons.reproduce import table
 from nocl.comparisons.reproduce.table import Place, grid, number
 from nocl.comparisons.studies import FINE, with_reference
@@ -243,7 +244,7 @@ def judged(problem: str, cnd: Any, n: int, seed: int) -> tuple[Array, int]:
     ocp = PROBLEMS[problem][1]()
     x0, p = drawn(ocp, n, seed)
     own, reference = with_reference(compare(ocp, {"CND": cnd}, x0=x0, p=p, progress=False), FINE).judged
-    best = np.minimum(optima(problem, n, seed), reference.simulation.cost)
+    best = np.minimum(optima(problem, n, seed), _held(reference))
     gap = np.where(own.simulation.success, (own.simulation.cost - best) / np.abs(best), np.inf)
     return gap, int((own.simulation.violation > 0).sum())
 
@@ -254,8 +255,13 @@ def optima(problem: str, n: int, seed: int) -> Array:
     ocp = PROBLEMS[problem][1]()
     x0, p = drawn(ocp, n, seed)
     found = compare(ocp, {"optimum": GlobalDDP(DDP(ocp, intervals=80), starts=32)}, x0=x0, p=p, progress=False)
-    cost: Array = np.min([j.simulation.cost for j in with_reference(found, FINE).judged], axis=0)
+    cost: Array = np.min([_held(j) for j in with_reference(found, FINE).judged], axis=0)
     return cost
+
+
+def _held(judged: Judged) -> Array:
+    """[n], what runs cost that hold all constraints; inf of others."""
+    return np.where(judged.simulation.success, judged.simulation.cost, np.inf)
 
 
 def _entry(problem: str, way: str, cells: Sequence[Cell]) -> Entry:
