@@ -89,6 +89,7 @@ class DDP:
         self.ocp, self.intervals, self.settings = ocp, int(intervals), settings or DDPSettings()
         self.constraints, self.dynamics, self.cache = constraints, dynamics, cache
         self.between = checks.flag(between, "between", "DDP")
+        self.margin: Array | None = None  # see `inside`
         self.checked = self.coarse = False  # whether the grid was held against the plant, and is too coarse for it
         self.left = substeps is None  # whether the grid was left to nocl
         self.threads = int(threads or os.cpu_count() or 1)
@@ -109,10 +110,18 @@ class DDP:
                              "expected the constraints of its problem: leave `rows` out, or use workers of this one")
         return {"ocp": self.ocp, "intervals": self.intervals, "substeps": self.substeps, "dynamics": self.dynamics,
                 "settings": self.settings, "constraints": self.constraints, "between": self.between,
-                "threads": self.threads, "cache": self.cache}
+                "threads": self.threads, "cache": self.cache, "margin": self.margin}
 
     def __setstate__(self, options: dict[str, Any]) -> None:
+        margin = options.pop("margin")
         DDP.__init__(self, **options)  # the kernel is built, or found in the cache, where it is needed
+        self.margin = margin
+
+    def inside(self, margin: Array) -> DDP:
+        """The same solver, which holds each row further inside, by shares of its scale [rows of a stage, then of the end]."""
+        other = self._with_threads(self.threads)
+        other.margin = np.asarray(margin, dtype=np.float64)
+        return other
 
     def solve(self, x0: ArrayLike, t0: ArrayLike = 0.0, *, u: Array | None = None, x: Array | None = None,
               gain: Array | None = None, p: Any = None, curvature: bool = False,
@@ -172,7 +181,7 @@ class DDP:
         dips = Dips(_functions(self.ocp, self.dynamics), self.rows)
         for _ in range(EXCHANGES):
             t = work.t0[:, None] + work.h[:, None] * np.arange(self.intervals + 1)
-            work.exchange(dips.margins(t, work.x, work.u, work.p))
+            work.exchange(work.with_margin(dips.margins(t, work.x, work.u, work.p)))
 
     def rollout(self, x0: Array, p: Array | None = None, **guess: Array) -> Array:
         """The states [B, K+1, nx] from x0 [B, nx] at t0 = 0 under a guess of `solve`'s: where the descent begins.
@@ -225,7 +234,8 @@ class DDP:
         net = None if self.dynamics is None else self.dynamics.net
         source = ddp_source(self.ocp, net, self.substeps, self.rows if self.held else None)
         return fingerprint(self.ocp.to_data(), source, self._weights, self.intervals, self.settings, self.constraints,
-                           *([self.between] if self.between else []), version("nocl"))
+                           *([self.between] if self.between else []), *([] if self.margin is None else [self.margin]),
+                           version("nocl"))
 
     def _run_key(self, x0: Array, t0: Array, p: Array, guess: dict[str, Array], curvature: bool) -> str:
         """A fingerprint of all that the solution depends on."""
