@@ -86,7 +86,9 @@ class Held:
 
     def next(self, margin: Array, exceeded: Array) -> Array:
         """The margins for labels of the next round."""
-        more = np.quantile(exceeded, 1 - SELDOM, axis=0, method="higher") if len(exceeded) else -FIRST
+        if not len(exceeded):
+            return margin
+        more = np.quantile(exceeded, 1 - SELDOM, axis=0, method="higher") - ALLOWED / 2
         return np.where(self.inward, np.clip(margin + more, 0.0, LARGEST), 0.0)
 
     def summary(self, exceeded: Array, name: str) -> dict[str, Any]:
