@@ -39,7 +39,7 @@ from nocl.ocp import OCP
 from nocl.solvers.cnd import TrainSettings
 from nocl.solvers.cnd.in_torch import InTorch
 from nocl.solvers.cnd.labels import policy_controls
-from nocl.solvers.cnd.validate import feasible, kicked_optima, tube_optima, value_scores
+from nocl.solvers.cnd.validate import kicked_optima, tube_optima, value_scores
 from nocl.solvers.ddp.bank import SolutionBank, better
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP
@@ -49,6 +49,12 @@ from nocl.support.checks import Array
 FINE = 640  # intervals of the reference
 COLD = 48  # cold starts from each of the worst states
 VALUE_STATES = 2048  # of the tube, and of kicked rollouts, on which V is judged
+
+
+def feasible(ocp: OCP, s: Solution) -> Solution:
+    """The solutions that hold all path constraints at all nodes: where a collision can no longer be avoided, V is that
+    of the penalty."""
+    return s[(ocp.least(s.x, s.t, s.parameters) >= 0).all(axis=1)] if ocp.h_titles else s
 
 
 def optimum(ocp: OCP, x0: Array, policy: FeatureNet) -> tuple[Solution, SolutionBank]:

@@ -72,8 +72,8 @@ class Held:
         return replace(s, success=s.success & (over <= LOST))
 
     def exceeded(self, policy: Policy, torch_ocp: InTorch, at: Problems, steps: int) -> Array:
-        """What the policy exceeds each row by as continuous feedback from there, in scales [B, m + those at the end]; less
-        than 0 where it stays inside.
+        """What the policy exceeds each row by as continuous feedback from there, in scales [B, m + those at the end];
+        less than 0 where it stays inside.
         """
         _, x, t = continuous_run(policy, torch_ocp, at, steps)
         B, nodes = t.shape

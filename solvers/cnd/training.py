@@ -102,13 +102,15 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
     _check(ocp, dynamics, seed, out)
     checks.word(method, ("default", "paper"), "method", "train")
     if method == "paper":
-        ocp.refuse_constraints("train with method='paper'", "train by the default method")
+        ocp.refuse_constraints(f"train with method={method!r}",
+                               "train by the default method, or solve it by NMPC or DDP")
         chosen = _expect(settings, PaperSettings)
         checkpoint = None if out is None else Path(out) / CHECKPOINT
         if features is not None:
             raise ValueError("train: features are for the default method; 'paper' has the paper's own: leave them out")
         policy, value, card = train_paper(ocp, dynamics, chosen, seed=seed, progress=progress, checkpoint=checkpoint)
         return CND(ocp, policy, value, card)
+    ocp.refuse_free("train")
     ocp.check_strict("train")
     own = own_features(ocp, features)
     usual = TrainSettings.of("normal", parameters=ocp.np)
@@ -118,7 +120,6 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
 
 def _check(ocp: OCP, dynamics: LearnedDynamics | None, seed: int, out: str | os.PathLike[str] | None) -> None:
     checks.instance(OCP, ocp, "ocp", "train", "nocl.load_ocp(name)")
-    ocp.refuse_free("train")
     checks.whole(seed, "seed", "train", most=2**62 - 1)
     if out is not None and Path(out).exists() and not Path(out).is_dir():
         raise ValueError(f"train: out is the file {out}; expected a folder for checkpoints")

@@ -32,7 +32,7 @@ LEAST, MOST, LARGEST = 1.0, 10.0, 1e7  # usual costs for a violation of one scal
 SHARE = 10.0  # of the guess's cost, what rho makes of its violations at first
 RHO_GROWTH = 4.0
 STALLS = 2  # rounds at the largest rho in which the violation does not halve: it cannot be held
-PRICE = 100.0  # usual costs for a violation of one scale over the whole horizon, or at its end, where constraints are elastic
+PRICE = 100.0  # usual costs for a violation of one scale over the whole horizon, or at its end, if they are elastic
 STIFF = 1e7  # usual costs, the weight of active rows in the sweep for gains
 KEPT = ("x", "u", "k", "gain", "J", "c", "parts", "y", "penalty", "state", "mu")  # of a plan
 
@@ -48,7 +48,7 @@ class Augmented(Work):
         d, B = self.ddp, len(self.x0)
         self.unit = usual_sizes(d.ocp).cost
         self.y, self.c, self.new_c = (np.zeros((B, d.rows.count(d.intervals))) for _ in range(3))
-        self.penalty = np.zeros((B, 4))  # rho, the largest multiplier, the weight in a sweep for gains, the largest one at the end
+        self.penalty = np.zeros((B, 4))  # rho, largest multiplier, weight in a sweep for gains, largest one at the end
         self.penalty[:, 0] = self.unit
         share = (d.ocp.horizon - self.t0) / d.ocp.horizon
         elastic = d.constraints == "elastic"
