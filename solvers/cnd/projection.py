@@ -2,8 +2,8 @@
 
 The map is a retraction: along the ray from a point u_c that holds all of them strictly, back to where the first one
 begins, u = v - (v - u_c) (1 - 1 / max(1, q)). What holds them is left as it is. Along a ray u_c + s d a row c is a
-parabola c_0 + b s + a s^2 with c_0 > 0 >= a, where it is affine or concave and quadratic in u, as half-spaces, balls and
-ellipsoids are; its zero is at s = 1 / q, q = (-b + sqrt(b^2 - 4 a c_0)) / (2 c_0), without a division by what may
+parabola c_0 + b s + a s^2 with c_0 > 0 >= a, where it is affine or concave and quadratic in u, as half-spaces, balls
+and ellipsoids are; its zero is at s = 1 / q, q = (-b + sqrt(b^2 - 4 a c_0)) / (2 c_0), without a division by what may
 vanish. From a point in the box U it stays there. Other rows that hold the control are learned as those of states are.
 """
 

@@ -60,7 +60,8 @@ class DDP:
         "hard": they hold at every node, to 1e-9 of their scales (OCP.constraint_scales), by the multipliers of an
         augmented Lagrangian; where no plan was found that holds them success is False, and the message names one.
         "elastic": the same, but a violation has a price: where holding them would cost more, they are left by as little
-        as pays, and the message says so; the cost has the price in it. "soft": they enter by the OCP's penalty, and nothing is held.
+        as pays, and the message says so; the cost has the price in it. "soft": they enter by the OCP's penalty, and
+        nothing is held.
     between : bool
         Whether they hold between nodes too, all but exactly: by margins at the nodes, exchanged twice, each time for as
         much as the plan dips between them.
