@@ -25,13 +25,12 @@ QUIET = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.
 def projected(ocp: OCP) -> NDArray[np.bool_]:
     """Which rows along a trajectory [m] the output map of a policy holds: affine or concave quadratic ones of u alone.
     """
-    rows, u = ocp.functions.rows, ocp.system.u
-    others = ca.vertcat(ocp.system.x, *(s for name, s in ocp.functions.arguments.symbols.items()
-                                        if name not in ("x", "u")))
+    rows, at = ocp.functions.rows, ocp.functions.arguments
+    others = ca.vertcat(*at.but("u").inputs)
     found = np.zeros(len(rows), dtype=bool)
     for i in np.flatnonzero(rows.of_u & ~rows.equal):
         c = rows.column[i]
-        found[i] = not ca.depends_on(c, others) and _concave(c, u)
+        found[i] = not ca.depends_on(c, others) and _concave(c, at["u"])
     return found
 
 
@@ -49,7 +48,7 @@ def retracted(ocp: OCP, v: ca.SX) -> ca.SX:
     mine = np.flatnonzero(projected(ocp))
     if not mine.size:
         return v
-    u, rows = ocp.system.u, ocp.functions.rows
+    u, rows = ocp.functions.arguments["u"], ocp.functions.rows
     centre, over = ca.DM(_centre(ocp, mine)), ca.SX(1)
     d = v - centre
     for i in mine:
@@ -68,15 +67,14 @@ def _centre(ocp: OCP, mine: NDArray[np.int64]) -> Array:
     Raises ValueError where no control holds all of them strictly.
     """
     s, scales = ocp.system, ocp.functions.scales[mine]
-    u, depth = s.u, ca.SX.sym("depth")
+    u, depth = ocp.functions.arguments["u"], ca.SX.sym("depth")
     half = (s.ubu - s.lbu) / 2
     inside = ca.vertcat(*(ocp.functions.rows.column[int(i)] / size for i, size in zip(mine, scales, strict=True)),
                         (u - ca.DM(s.lbu)) / ca.DM(half), (ca.DM(s.ubu) - u) / ca.DM(half))
     deepest = ca.nlpsol("deepest", "ipopt", {"x": ca.vertcat(u, depth), "f": -depth, "g": inside - depth}, QUIET)
     start = (s.lbu + s.ubu) / 2
     z = deepest(x0=np.r_[start, 0.0], lbg=0.0, lbx=np.r_[s.lbu, -np.inf], ubx=np.r_[s.ubu, 1.0])["x"].full().ravel()
-    least = ca.Function("least", [u], [ca.mmin(inside)])
-    most, at_goal = float(least(z[:-1])), float(least(ocp.u_goal))
+    most, at_goal = (float(ca.evalf(ca.mmin(ca.substitute(inside, u, ca.DM(at))))) for at in (z[:-1], ocp.u_goal))
     if not most > 0:
         names = ", ".join(dict.fromkeys(repr(ocp.functions.rows.names[i]) for i in mine))
         raise ValueError(f"no control in U holds {names} with room to spare; expected constraints of u alone that some "
