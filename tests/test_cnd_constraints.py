@@ -16,6 +16,7 @@ from nocl.solvers.cnd.held import ALLOWED, FIRST, LARGEST, LOST, Held
 from nocl.solvers.cnd.in_torch import InTorch
 from nocl.solvers.cnd.labels import Labels, Problems
 from nocl.solvers.cnd.projection import projected, retracted
+from nocl.solvers.cnd.training import Training
 from nocl.solvers.ddp.solver import DDP
 from nocl.solvers.ddp.without_compiler import NumpyKernel
 from nocl.translate.torch_functions import to_torch
@@ -237,10 +238,15 @@ def test_what_is_not_taken_is_refused_by_name():
         nocl.train(free)
 
 
+def interrupted(training: Training) -> None:
+    raise KeyboardInterrupt
+
+
 @pytest.mark.slow
-def test_a_trained_controller_says_what_it_violates(tmp_path):
+def test_a_trained_controller_says_what_it_violates(tmp_path, monkeypatch):
+    """And one that was interrupted after its first round goes on to the same."""
     ocp = double_integrator()
-    cnd = nocl.train(ocp, settings=TINY, seed=0, progress=False, out=tmp_path / "checkpoint")
+    cnd = nocl.train(ocp, settings=TINY, seed=0, progress=False)
     row = cnd.card["history"][-1]
     assert set(row) >= {"gap_violating", "gap_worst", "kicked_violating", "infeasible", "margin"}
     assert set(row["gap_worst"]) == {"thrust", "speed"}
@@ -249,5 +255,8 @@ def test_a_trained_controller_says_what_it_violates(tmp_path):
     assert row["gap_median"] < 0.05
     x0 = ocp.initial_states.sample(20, 5)
     assert thrust(nocl.simulate(ocp, cnd, x0).u) <= 1 + 1e-12
-    again = nocl.train(ocp, settings=TINY, seed=0, progress=False, out=tmp_path / "checkpoint")
+    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+        patched.setattr(Training, "_visit", interrupted)
+        nocl.train(ocp, settings=TINY, seed=0, progress=False, out=tmp_path)
+    again = nocl.train(ocp, settings=TINY, seed=0, progress=False, out=tmp_path)
     np.testing.assert_array_equal(again(x0), cnd(x0))

@@ -202,20 +202,24 @@ class Training:
 
             first = Problems.initial(self.ocp, s.seeds, rng)
             seeds = solve_globally(self.ddp, first.x, p=first.given_p, starts=s.starts, seed=rng, report=report)
-            self.bank = SolutionBank.of(self.ddp, seeds)
+            self.bank = SolutionBank.of(self.ddp, self._held(seeds))
             if s.states:
                 further = Problems.initial(self.ocp, s.states, rng)
                 more = extend(self.ddp, self.bank, further.x, NEIGHBOURS if self.ocp.np else 3, p=further.given_p)
-                self.bank = SolutionBank.of(self.ddp, type(more).join([seeds, more]))
+                self.bank = SolutionBank.of(self.ddp, self._held(type(more).join([seeds, more])))
             parts = [self.bank.solution] + ([tube(self.ddp, self.bank, s.tails, s.width, rng)] if s.tails else [])
             self.labels = Labels.join([self._labels(p, rng) for p in parts])
             self.first = len(self.labels)
 
+    def _held(self, solution: Solution) -> Solution:
+        """Without success where constraints are lost."""
+        return solution if self.held is None else self.held.labels(solution)
+
     def _labels(self, solution: Solution, rng: np.random.Generator) -> Labels:
         """Labels of the continuous controls, and with control_dt of held ones."""
         if self.held is not None:
-            solution = self.held.labels(solution)
-            self.solved.append(solution[solution.success])
+            solution = self._held(solution)
+            self.solved += [solution[solution.success]] if solution.success.any() else []
         parts = [Labels.of(solution, self.in_torch, self._unit(), self.substeps)]
         if self.settings.control_dt:
             parts += [Labels.held(solution, self._unit()), at_other_rates(self.ddp, solution, self._unit(), rng)]
@@ -416,7 +420,11 @@ class Training:
             return
         state = {"policy": self.net.state_dict(), "labels": _tensors(vars(self.labels)),
                  "bank": _tensors({k: v for k, v in vars(self.bank.solution).items() if k != "message"})}
-        meta = {"identity": self._identity(), "round": self.round, "history": self.history, "seconds": self.seconds,
+        for i, s in enumerate(self.solved):
+            state[f"solved-{i}"] = _tensors({k: v for k, v in s.arrays().items() if k != "message"})
+        meta = {"identity": self._identity(), "solved": len(self.solved),
+                "margin": None if self.margin is None else self.margin.tolist(),
+                "round": self.round, "history": self.history, "seconds": self.seconds,
                 "fitting": self.fitting, "fitting_cpu": self.fitting_cpu,
                 "first": self.first, "evaluations": self._evaluations()}
         self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
@@ -432,6 +440,9 @@ class Training:
         arrays = _arrays(state["labels"])
         self.labels = Labels(**{"p": np.zeros((len(arrays["t"]), 0)), **arrays})  # no empty arrays are in files
         self.bank = SolutionBank.from_arrays(self.ddp, _arrays(state["bank"]))
+        if meta["margin"] is not None:
+            self._inside(np.array(meta["margin"]))
+        self.solved = [_converged(_arrays(state[f"solved-{i}"])) for i in range(meta["solved"])]
         self.round, self.history, self.first = meta["round"], meta["history"], meta["first"]
         self.seconds, self.fitting, self.fitting_cpu = meta["seconds"], meta["fitting"], meta["fitting_cpu"]
         self.evaluations = meta.get("evaluations", 0)
@@ -439,6 +450,11 @@ class Training:
         self.net.double().load_state_dict(state["policy"])
         self.net.eval().requires_grad_(False)
         return True
+
+
+def _converged(arrays: dict[str, Array]) -> Solution:
+    """Solutions that all succeeded, from their arrays without messages."""
+    return Solution.of_arrays({**arrays, "message": np.full(len(arrays["cost"]), "converged")})
 
 
 class _Reporter:
