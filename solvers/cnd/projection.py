@@ -9,6 +9,8 @@ vanish. From a point in the box U it stays there. Other rows that hold the contr
 
 from __future__ import annotations
 
+from typing import Any
+
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +21,7 @@ from nocl.support.checks import Array
 CURVED = 1e-9  # of the largest entry: a Hessian's eigenvalue above that is not concave
 DEEP = 0.2  # of the deepest point's distance to what is held: u* is the centre where it is as deep
 TINY = 1e-30  # under the root, whose slope at 0 is inf
-QUIET = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-8}
+QUIET: dict[str, Any] = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-8}
 
 
 def projected(ocp: OCP) -> NDArray[np.bool_]:
@@ -29,7 +31,7 @@ def projected(ocp: OCP) -> NDArray[np.bool_]:
     others = ca.vertcat(*at.but("u").inputs)
     found = np.zeros(len(rows), dtype=bool)
     for i in np.flatnonzero(rows.of_u & ~rows.equal):
-        c = rows.column[i]
+        c = rows.column[int(i)]
         found[i] = not ca.depends_on(c, others) and _concave(c, at["u"])
     return found
 
