@@ -209,7 +209,7 @@ def _run(args: argparse.Namespace) -> None:
     from nocl.cli.run_folder import RunFolder  # torch
 
     ocp, out = _problem(args)
-    ocp.refuse_constraints("nocl run")
+    ocp.refuse_free("nocl run")
     if not args.exact:
         _check_learnable(ocp)
     stages = RunFolder(ocp, out, args.seed, args.effort)
@@ -253,7 +253,7 @@ def _train(args: argparse.Namespace) -> None:
     from nocl.cli.run_folder import RunFolder  # torch
 
     ocp, out = _problem(args)
-    ocp.refuse_constraints("nocl train")
+    ocp.refuse_free("nocl train")
     if not args.exact:
         _check_learnable(ocp)
     stages = RunFolder(ocp, out, args.seed, args.effort)

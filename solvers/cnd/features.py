@@ -17,6 +17,7 @@ import numpy as np
 from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
 from nocl.scales import usual_sizes
+from nocl.solvers.cnd.projection import retracted
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.translate.arguments import Arguments
@@ -161,7 +162,8 @@ def _polynomial(coefficients: Array, tau: ca.SX) -> ca.SX:
 
 def policy_net(ocp: OCP, labels: Labels, sizes: tuple[int, ...], control_dt: bool = False,
                own: ca.Function | None = None, branches: int = 1) -> tuple[FeatureNet, ca.Function]:
-    """(u = clip(mean + spread * y, U), y a tanh network of the features; and u -> y, its inverse inside U).
+    """(u = clip(mean + spread * y, U), y a tanh network of the features; and u -> y, its inverse inside U). Constraints
+    of u alone are held on top (projection.py).
 
     control_dt: (x, t[, p], dt) -> u in place of (x, t[, p]) -> u. own: further features. With `branches` > 1 the
     network says as many y, and a number for each: that with the largest number is taken.
@@ -172,7 +174,7 @@ def policy_net(ocp: OCP, labels: Labels, sizes: tuple[int, ...], control_dt: boo
     said = branches * (s.nu + 1) if branches > 1 else s.nu
     y, u = ca.SX.sym("y", said), ca.SX.sym("u", s.nu)
     clipped = ca.fmin(ca.fmax(mean + spread * _chosen(y, s.nu, branches), ca.DM(s.lbu)), ca.DM(s.ubu))
-    outputs = Arguments.of(phi).function("controls", {"u": clipped}, y=y)
+    outputs = Arguments.of(phi).function("controls", {"u": retracted(ocp, clipped)}, y=y)
     net = FeatureNet(phi, [MLP([phi.numel_out(0), *sizes, said])], outputs)
     return net, ca.Function("inverse", [u], [(u - mean) / spread], ["u"], ["y"])
 

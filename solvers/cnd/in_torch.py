@@ -1,4 +1,7 @@
-"""An OCP in torch, as training uses it: f, L_soft and G of rows that have parameters of their own."""
+"""An OCP in torch, as training uses it: f, L and G of rows that have parameters of their own.
+
+Path constraints alone are a penalty in L; where there are others, labels hold all of them, and L is the problem's own.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ Function = Callable[..., Tensor]
 
 
 class InTorch:
-    """f, L_soft and G of a problem as torch functions of what they take among (x, u, t, p).
+    """f, L and G of a problem as torch functions of what they take among (x, u, t, p).
 
     dynamics : (x, u[, t][, p of the system]) -> xdot in torch, as learned, in place of the exact f
     """
@@ -28,7 +31,8 @@ class InTorch:
         self.takes = {"f": names if dynamics is None else ocp.system.arguments.names, "L": names,
                       "G": ocp.functions.end.names}
         self.n_p = {"f": ocp.np if dynamics is None else ocp.system.np, "L": ocp.np, "G": ocp.np}
-        self.function = {"f": dynamics or to_torch(ocp.functions.f), "L": to_torch(ocp.L_soft), "G": to_torch(ocp.G)}
+        L = ocp.L if ocp.in_scales else ocp.L_soft
+        self.function = {"f": dynamics or to_torch(ocp.functions.f), "L": to_torch(L), "G": to_torch(ocp.G)}
 
     def at(self, p: Array) -> Rows:
         """The problem for rows with parameters p [B, np]."""
@@ -60,7 +64,7 @@ class Rows:
         return self.of.call("G", x=x, p=self._p)
 
     def interval(self, x: Tensor, u: Tensor, t: Any, h: Any, substeps: int = 1) -> tuple[Tensor, Tensor]:
-        """(the states after intervals of length h from t on with u held, the integral of L_soft over them)."""
+        """(the states after intervals of length h from t on with u held, the integral of L over them)."""
         return rk4_cost(self.f, self.L, x, u, h, substeps, t if self.of.timed else None)
 
     def after(self, x: Tensor, u: Tensor, t: Any, h: Any, substeps: int = 1) -> Tensor:

@@ -238,7 +238,13 @@ def policy_controls(policy: Policy, torch_ocp: InTorch, at: Problems, K: int, su
 
 
 def continuous_cost(policy: Policy, torch_ocp: InTorch, at: Problems, steps: int) -> Array:
-    """J [B] of the policy as continuous feedback from there, by RK4 on (x, t, cost); soft path constraints included."""
+    """J [B] of the policy as continuous feedback from there."""
+    return continuous_run(policy, torch_ocp, at, steps)[0]
+
+
+def continuous_run(policy: Policy, torch_ocp: InTorch, at: Problems, steps: int) -> tuple[Array, Array, Array]:
+    """The policy as continuous feedback from there, by RK4 on (x, t, cost): J [B], x [B, steps+1, nx], t [B, steps+1].
+    """
     n, here = at.x.shape[1], torch_ocp.at(at.p)
 
     def closed_loop(z: Tensor, _: None) -> Tensor:
@@ -248,7 +254,10 @@ def continuous_cost(policy: Policy, torch_ocp: InTorch, at: Problems, steps: int
 
     z = torch.from_numpy(np.column_stack([at.x, at.t, np.zeros(len(at))]))
     h = torch.from_numpy((torch_ocp.ocp.horizon - at.t) / steps)[:, None]
+    path = [z]
     with torch.no_grad():
         for _ in range(steps):
-            z = rk4(closed_loop, z, None, h)
-        return (z[:, n + 1] + here.G(z[:, :n])[:, 0]).numpy()
+            path.append(rk4(closed_loop, path[-1], None, h))
+        J = (path[-1][:, n + 1] + here.G(path[-1][:, :n])[:, 0]).numpy()
+    way = torch.stack(path, dim=1).numpy()
+    return J, np.ascontiguousarray(way[..., :n]), np.ascontiguousarray(way[..., n])

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from nocl import hjb
 from nocl.nets import ACTIVATIONS
 from nocl.support import checks
-from nocl.support.fields import Checked, Scaled, choice, coefficients, count, flag, positive, widths
+from nocl.support.fields import Checked, Scaled, choice, coefficients, count, flag, nonnegative, positive, widths
 from nocl.translate.rk4 import rk4_cost
 
 STEPS: dict[str, hjb.Step] = {"rk4": rk4_cost, "euler": hjb.euler_cost}
@@ -77,6 +77,7 @@ class TrainSettings(Scaled):
     held_out: int = count(64, "initial states that tell when to stop")
     gap_median: float = positive(2e-4, "stop once both are met: (J - J*) / J*, median over the held-out states")
     gap_p95: float = positive(1e-3, "and its 95th percentile")
+    violating: float = nonnegative(0.01, "and this: the share of held-out runs that violate a constraint")
 
 
 def _times(value: Any, factor: float) -> Any:

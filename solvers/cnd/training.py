@@ -34,6 +34,7 @@ from nocl.ocp import OCP
 from nocl.sampling import own_numbers
 from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.features import at_rate, own_features, policy_net
+from nocl.solvers.cnd.held import Held
 from nocl.solvers.cnd.identity import identity
 from nocl.solvers.cnd.in_torch import InTorch
 from nocl.solvers.cnd.labels import KEPT, NEIGHBOURS, Labels, Problems, answered, at_other_rates, rivals, tube, visited
@@ -42,9 +43,11 @@ from nocl.solvers.cnd.regress import fit_net, policy_loss
 from nocl.solvers.cnd.settings import TrainSettings
 from nocl.solvers.cnd.validate import (
     advice,
+    cannot_hold,
     feasible,
     gap,
     held_gap,
+    held_out,
     held_out_optima,
     kicked_optima,
     summary,
@@ -69,6 +72,7 @@ __all__ = ["TrainSettings", "train"]
 CHECKPOINT = "training.safetensors"
 VALUE_LARGE = 0.05  # mean |V - J*| / J* that a warning is given above
 VALUE_HELD_OUT = 16  # times held_out: a mean of relative errors hangs on the few states that are hard
+MARGINS = 2  # rounds that begin with new margins, where there are constraints
 LOSSES = 40  # of each regression that the card keeps
 
 
@@ -99,12 +103,15 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
     _check(ocp, dynamics, seed, out)
     checks.word(method, ("default", "paper"), "method", "train")
     if method == "paper":
+        ocp.refuse_constraints(f"train with method={method!r}",
+                               "train by the default method, or solve it by NMPC or DDP")
         chosen = _expect(settings, PaperSettings)
         checkpoint = None if out is None else Path(out) / CHECKPOINT
         if features is not None:
             raise ValueError("train: features are for the default method; 'paper' has the paper's own: leave them out")
         policy, value, card = train_paper(ocp, dynamics, chosen, seed=seed, progress=progress, checkpoint=checkpoint)
         return CND(ocp, policy, value, card)
+    ocp.refuse_free("train")
     ocp.check_strict("train")
     own = own_features(ocp, features)
     usual = TrainSettings.of("normal", parameters=ocp.np)
@@ -114,7 +121,6 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
 
 def _check(ocp: OCP, dynamics: LearnedDynamics | None, seed: int, out: str | os.PathLike[str] | None) -> None:
     checks.instance(OCP, ocp, "ocp", "train", "nocl.load_ocp(name)")
-    ocp.refuse_constraints("train")
     checks.whole(seed, "seed", "train", most=2**62 - 1)
     if out is not None and Path(out).exists() and not Path(out).is_dir():
         raise ValueError(f"train: out is the file {out}; expected a folder for checkpoints")
@@ -142,15 +148,25 @@ class Training:
         self.learned = dynamics is not None
         self.in_torch = InTorch(ocp, dynamics)
         self.substeps = settings.substeps or substeps_for(ocp, dynamics, settings.intervals, FINE)
-        soft = {"dynamics": dynamics, "constraints": "soft"}
-        self.ddp = DDP(ocp, intervals=settings.intervals, substeps=self.substeps, **soft)
-        self.fine = DDP(ocp, intervals=4 * settings.intervals, substeps=-(-self.substeps // 4), **soft)
+        self.held = Held(ocp) if ocp.in_scales else None  # path constraints alone are a penalty
+        coarse, fine = ("soft", "soft") if self.held is None else ("elastic", "hard")
+        self.plain = DDP(ocp, intervals=settings.intervals, substeps=self.substeps, dynamics=dynamics,
+                         constraints=coarse)
+        self.fine = DDP(ocp, intervals=4 * settings.intervals, substeps=-(-self.substeps // 4), dynamics=dynamics,
+                        constraints=fine)
+        self.solved: list[Solution] = []  # what the labels are of, where constraints have margins that may change
+        self._inside(None if self.held is None else self.held.first)
         self.checkpoint = None if out is None else Path(out) / CHECKPOINT
         self.hidden_progress = None if progress is None else not progress
         self.round, self.seconds, self.fitting, self.fitting_cpu, self.evaluations = 0, 0.0, 0.0, 0.0, 0
         self.history: list[dict[str, Any]] = []
         self.losses: list[float] = []
         self.value_card: dict[str, Any] = {}
+
+    def _inside(self, margin: Array | None) -> None:
+        """Labels keep these margins from now on."""
+        self.margin = margin
+        self.ddp = self.plain if margin is None or self.held is None else self.held.solver(self.plain, margin)
 
     def run(self) -> CND:
         with one_thread():
@@ -163,6 +179,7 @@ class Training:
             self._network()
         while self.round <= s.rounds and not self._good_enough():
             if self.round:
+                self._move_margins()
                 self._visit()
             self._regress(s.iterations * (2 if self.round >= max(s.least_rounds, 1) else 1))
             self._validate()
@@ -188,20 +205,27 @@ class Training:
 
             first = Problems.initial(self.ocp, s.seeds, rng)
             seeds = solve_globally(self.ddp, first.x, p=first.given_p, starts=s.starts, seed=rng, report=report)
-            self.bank = SolutionBank.of(self.ddp, seeds)
+            self.bank = SolutionBank.of(self.ddp, self._held(seeds))
             if s.states:
                 further = Problems.initial(self.ocp, s.states, rng)
                 several = {"neighbours": NEIGHBOURS, "kept": KEPT} if self.ocp.np else {}
                 more = extend(self.ddp, self.bank, further.x, p=further.given_p, **several)
-                self.bank = SolutionBank.of(self.ddp, type(more).join([seeds, more]))
+                self.bank = SolutionBank.of(self.ddp, self._held(type(more).join([seeds, more])))
             if self.ocp.np and rivals(self.ddp, self.bank, self._rng(5_000_000)):
                 self.bank = replace(self.bank, several=NEIGHBOURS)
             parts = [self.bank.solution] + ([tube(self.ddp, self.bank, s.tails, s.width, rng)] if s.tails else [])
             self.labels = Labels.join([self._labels(p, rng) for p in parts])
             self.first = len(self.labels)
 
+    def _held(self, solution: Solution) -> Solution:
+        """Without success where constraints are lost."""
+        return solution if self.held is None else self.held.labels(solution)
+
     def _labels(self, solution: Solution, rng: np.random.Generator) -> Labels:
         """Labels of the continuous controls, and with control_dt of held ones."""
+        if self.held is not None:
+            solution = self._held(solution)
+            self.solved += [solution[solution.success]] if solution.success.any() else []
         parts = [Labels.of(solution, self.in_torch, self._unit(), self.substeps)]
         if self.settings.control_dt:
             parts += [Labels.held(solution, self._unit()), at_other_rates(self.ddp, solution, self._unit(), rng)]
@@ -217,6 +241,21 @@ class Training:
             self.net, self.inverse = policy_net(self.ocp, self.labels[: self.first], self.settings.hidden,
                                                 self.settings.control_dt, self.own, self.settings.branches)
         self.policy = at_rate(self.net, 0.0) if self.settings.control_dt else self.net  # in continuous time
+
+    def _move_margins(self) -> None:
+        """New margins by what the policy violated, and all labels solved again with them."""
+        if self.held is None or self.round > MARGINS:
+            return
+        self._inside(np.array(self.history[-1]["next_margin"]))
+        rng, former, self.solved = self._rng(4_000_000 + self.round), self.solved, []
+        with self._stage(f"round {self.round}: labels with other margins", len(former)) as bar:
+            parts = []
+            for s in former:
+                again = self.ddp.solve(s.x[:, 0], s.t[:, 0], p=s.p, u=s.u, x=s.x, gain=s.gain)
+                parts.append(self._labels(again, rng))
+                bar.update()
+            self.labels = Labels.join(parts)
+            self.bank = SolutionBank.of(self.ddp, self.solved[0])
 
     def _visit(self) -> None:
         s, rng = self.settings, self._rng(self.round)
@@ -256,12 +295,15 @@ class Training:
         s, rng = self.settings, self._rng(1_000_000)
         with self._stage("held-out states", 1) as bar:
             solvers, acting = (self.ddp, self.fine, self.bank), (self.policy, self.in_torch)
-            starts = held_out_optima(*solvers, Problems.initial(self.ocp, s.held_out, rng))
+            fresh = held_out(*solvers, Problems.initial(self.ocp, s.held_out, rng))
+            starts = fresh[fresh.success]
             tails = kicked_optima(*solvers, *acting, 4 * s.held_out, s.kick, rng)
             row = {"round": self.round, "labels": len(self.labels), "loss": self.losses,
-                   "unsolved": s.held_out - len(starts),
+                   "unsolved": s.held_out - len(starts) - cannot_hold(fresh),
                    **summary(gap(*acting, starts, substeps=self.fine.substeps), "gap"),
                    **summary(gap(*acting, tails, self._unit(), self.fine.substeps), "kicked")}
+            if self.held is not None:
+                row |= self._violations(starts, tails) | {"infeasible": cannot_hold(fresh)}
             if s.control_dt:
                 best = extend(self.ddp, self.bank, starts.x[:, 0], p=starts.p)
                 held = at_rate(self.net, self.ocp.horizon / s.intervals)
@@ -271,11 +313,23 @@ class Training:
             bar.update()
         self.history.append(row)
 
+    def _violations(self, starts: Solution, tails: Solution) -> dict[str, Any]:
+        """What the policy violates on held-out states, and the margins that follow from it."""
+        assert self.held is not None
+        assert self.margin is not None
+        steps, over = self.fine.substeps * self.fine.intervals, []
+        for s in (starts, tails):
+            at = Problems(s.x[:, 0], s.t[:, 0], s.parameters)
+            over.append(self.held.exceeded(self.policy, self.in_torch, at, steps))
+        return {**self.held.summary(over[0], "gap"), **self.held.summary(over[1], "kicked"),
+                "margin": self.margin.tolist(), "next_margin": self.held.next(self.margin, over[0]).tolist()}
+
     def _good_enough(self) -> bool:
         if self.round <= self.settings.least_rounds:
             return False
         last, s = self.history[-1], self.settings
-        return bool(last["gap_median"] <= s.gap_median and last["gap_p95"] <= s.gap_p95)
+        met = bool(last["gap_median"] <= s.gap_median and last["gap_p95"] <= s.gap_p95)
+        return met and (self.held is None or last["gap_violating"] <= s.violating)
 
     def _value(self) -> FeatureNet:
         """V, fitted again on more labels where the held-out states ask for it; the best fit is kept."""
@@ -316,7 +370,7 @@ class Training:
             bar.update()
             sets["tails"] = kicked_optima(*solvers, *acting, n, s.kick, rng)
             bar.update()
-        held = {name: feasible(self.ocp, optima) for name, optima in sets.items()}
+        held = sets if self.held else {name: feasible(self.ocp, optima) for name, optima in sets.items()}
         return {name: optima for name, optima in held.items() if len(optima)} or sets
 
     def _value_labels(self, rng: np.random.Generator) -> ValueLabels:
@@ -373,7 +427,11 @@ class Training:
             return
         state = {"policy": self.net.state_dict(), "labels": _tensors(vars(self.labels)),
                  "bank": _tensors({k: v for k, v in vars(self.bank.solution).items() if k != "message"})}
-        meta = {"identity": self._identity(), "round": self.round, "history": self.history, "seconds": self.seconds,
+        for i, s in enumerate(self.solved):
+            state[f"solved-{i}"] = _tensors({k: v for k, v in s.arrays().items() if k != "message"})
+        meta = {"identity": self._identity(), "solved": len(self.solved),
+                "margin": None if self.margin is None else self.margin.tolist(),
+                "round": self.round, "history": self.history, "seconds": self.seconds,
                 "fitting": self.fitting, "fitting_cpu": self.fitting_cpu,
                 "first": self.first, "several": self.bank.several, "evaluations": self._evaluations()}
         self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
@@ -389,6 +447,9 @@ class Training:
         arrays = _arrays(state["labels"])
         self.labels = Labels(**{"p": np.zeros((len(arrays["t"]), 0)), **arrays})  # no empty arrays are in files
         self.bank = replace(SolutionBank.from_arrays(self.ddp, _arrays(state["bank"])), several=meta.get("several", 1))
+        if meta["margin"] is not None:
+            self._inside(np.array(meta["margin"]))
+        self.solved = [_converged(_arrays(state[f"solved-{i}"])) for i in range(meta["solved"])]
         self.round, self.history, self.first = meta["round"], meta["history"], meta["first"]
         self.seconds, self.fitting, self.fitting_cpu = meta["seconds"], meta["fitting"], meta["fitting_cpu"]
         self.evaluations = meta.get("evaluations", 0)
@@ -396,6 +457,11 @@ class Training:
         self.net.double().load_state_dict(state["policy"])
         self.net.eval().requires_grad_(False)
         return True
+
+
+def _converged(arrays: dict[str, Array]) -> Solution:
+    """Solutions that all succeeded, from their arrays without messages."""
+    return Solution.of_arrays({**arrays, "message": np.full(len(arrays["cost"]), "converged")})
 
 
 class _Reporter:

@@ -22,15 +22,31 @@ NODES = 16  # of each solution at which the HJB residual is taken
 
 
 def refined(fine: DDP, coarse: Solution) -> Solution:
-    """The solutions that succeeded, solved again on the fine grid."""
-    s = coarse[coarse.success]
-    finer = fine.solve(s.x[:, 0], s.t[:, 0], p=s.p, u=np.repeat(s.u, fine.intervals // s.u.shape[1], axis=1))
+    """The solutions that succeeded, solved again on the fine grid: those that succeed there."""
+    finer = solved_again(fine, coarse)
     return finer[finer.success]
 
 
+def solved_again(fine: DDP, coarse: Solution) -> Solution:
+    """The solutions that succeeded, solved again on the fine grid."""
+    s = coarse[coarse.success]
+    return fine.solve(s.x[:, 0], s.t[:, 0], p=s.p, u=np.repeat(s.u, fine.intervals // s.u.shape[1], axis=1))
+
+
+def held_out(ddp: DDP, fine: DDP, bank: SolutionBank, fresh: Problems) -> Solution:
+    """Fresh initial states, solved from the bank's nearest."""
+    return solved_again(fine, extend(ddp, bank, fresh.x, p=fresh.given_p))
+
+
 def held_out_optima(ddp: DDP, fine: DDP, bank: SolutionBank, fresh: Problems) -> Solution:
-    """The optima of fresh initial states, from the bank's nearest."""
-    return refined(fine, extend(ddp, bank, fresh.x, p=fresh.given_p))
+    """The optima of fresh initial states."""
+    solved = held_out(ddp, fine, bank, fresh)
+    return solved[solved.success]
+
+
+def cannot_hold(s: Solution) -> int:
+    """How many were not solved because nothing was found that holds their constraints."""
+    return int(np.char.startswith(s.message[~s.success], "infeasible").sum())
 
 
 def kicked_optima(ddp: DDP, fine: DDP, bank: SolutionBank, policy: Policy, torch_ocp: InTorch, n: int, kick: float,
@@ -41,7 +57,7 @@ def kicked_optima(ddp: DDP, fine: DDP, bank: SolutionBank, policy: Policy, torch
 
 
 def feasible(ocp: OCP, s: Solution) -> Solution:
-    """The solutions that hold all constraints at all nodes: where a collision can no longer be avoided, V is that
+    """The solutions that hold all path constraints at all nodes: where a collision can no longer be avoided, V is that
     of the penalty."""
     if not ocp.h_titles:
         return s

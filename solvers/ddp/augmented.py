@@ -32,7 +32,7 @@ LEAST, MOST, LARGEST = 1.0, 10.0, 1e7  # usual costs for a violation of one scal
 SHARE = 10.0  # of the guess's cost, what rho makes of its violations at first
 RHO_GROWTH = 4.0
 STALLS = 2  # rounds at the largest rho in which the violation does not halve: it cannot be held
-PRICE = 100.0  # usual costs for a violation of one scale over the whole horizon, where constraints are elastic
+PRICE = 100.0  # usual costs for a violation of one scale over the whole horizon, or at its end, if they are elastic
 STIFF = 1e7  # usual costs, the weight of active rows in the sweep for gains
 KEPT = ("x", "u", "k", "gain", "J", "c", "parts", "y", "penalty", "state", "mu")  # of a plan
 
@@ -48,10 +48,13 @@ class Augmented(Work):
         d, B = self.ddp, len(self.x0)
         self.unit = usual_sizes(d.ocp).cost
         self.y, self.c, self.new_c = (np.zeros((B, d.rows.count(d.intervals))) for _ in range(3))
-        self.penalty = np.zeros((B, 3))  # rho, the largest multiplier, the weight in a sweep for gains
+        self.penalty = np.zeros((B, 4))  # rho, largest multiplier, weight in a sweep for gains, largest one at the end
         self.penalty[:, 0] = self.unit
         share = (d.ocp.horizon - self.t0) / d.ocp.horizon
-        self.penalty[:, 1] = PRICE * self.unit * share / d.intervals if d.constraints == "elastic" else np.inf
+        elastic = d.constraints == "elastic"
+        self.penalty[:, 1] = PRICE * self.unit * share / d.intervals if elastic else np.inf
+        self.penalty[:, 3] = PRICE * self.unit if elastic else np.inf
+        self.margin = None if d.margin is None else self.with_margin(np.zeros_like(self.y))
         self.parts, self.new_parts = np.zeros((B, 3)), np.zeros((B, 3))  # cost, sum rho e^2 / 2, max |e|
         self.last, self.stalls = np.full(B, np.inf), np.zeros(B, dtype=np.int64)
         self.cut = np.zeros(B, dtype=bool)  # where margins could not be held
@@ -70,6 +73,16 @@ class Augmented(Work):
         growth = rho / self.penalty[:, 0]
         self.J[:] = self.parts[:, 0] + growth * (self.J - self.parts[:, 0])  # with y = 0 psi is proportional to rho
         self.penalty[:, 0], self.parts[:, 1] = rho, growth * self.parts[:, 1]
+
+    def with_margin(self, margin: Array) -> Array:
+        """Margins [B, rows of a plan], and on top of them the solver's own; what x0 alone decides has none."""
+        d = self.ddp
+        if d.margin is None:
+            return margin
+        n = len(d.rows.stage)
+        own = np.r_[np.tile(d.margin[:n], d.intervals), d.margin[n:]]
+        own[:n][d.rows.of_x(d.ocp.functions.arguments["u"])] = 0.0
+        return margin + own
 
     def exchange(self, margin: Array) -> None:
         """Solves what converged again, held further inside by margins [B, rows]; what cannot be, stays as it was."""
@@ -133,7 +146,8 @@ class Augmented(Work):
                  self.parts, threads=d.threads)
 
     def _cost(self) -> Array:
-        return self.parts[:, 0]
+        """J; where constraints are elastic, with the price of what is left."""
+        return self.J if self.ddp.constraints == "elastic" else self.parts[:, 0]
 
     def _last_sweep(self, *values: Array | None) -> None:
         """Active rows are stiff in it, so that gains keep to them: V_x is the same, V_xx and gains are not."""

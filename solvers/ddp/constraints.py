@@ -70,6 +70,10 @@ class ConstraintRows:
         block, i = (self.stage, row - node * n) if node < intervals else (self.end, row - intervals * n)
         return block.names[i], node, float(block.scales[i])
 
+    def end_own(self, u: ca.SX) -> Mask:
+        """The end's rows that are no stage's [n]."""
+        return np.arange(len(self.end)) >= self.of_x(u).sum()
+
     def of_x(self, u: ca.SX) -> Mask:
         """The stage's rows that hold no control [n]: at node 0 nothing can be done about them."""
         pattern = ca.jacobian_sparsity(self.stage.c, u).get_triplet()[0]
@@ -111,7 +115,7 @@ def rows_source(ocp: OCP, rows: ConstraintRows, stage: dict[str, ca.SX]) -> list
     end = {name: value for name, value in stage.items() if name != "u"}
     of_x = rows.of_x(stage["u"])
     lines = [f"#define NC {len(rows.stage)}", f"#define NT {len(rows.end)}", _flags("EQUAL", rows.stage.equal),
-             _flags("OF_X", of_x), _flags("END_EQUAL", rows.end.equal)]
+             _flags("OF_X", of_x), _flags("END_EQUAL", rows.end.equal), _flags("END_OWN", rows.end_own(stage["u"]))]
     for name, block, given, z in (("stage", rows.stage, stage, ca.vertcat(stage["x"], stage["u"])),
                                   ("end", rows.end, end, stage["x"])):
         p = parameters(ocp)

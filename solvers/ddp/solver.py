@@ -61,7 +61,8 @@ class DDP:
         "hard": they hold at every node, to 1e-9 of their scales (OCP.constraint_scales), by the multipliers of an
         augmented Lagrangian; where no plan was found that holds them success is False, and the message names one.
         "elastic": the same, but a violation has a price: where holding them would cost more, they are left by as little
-        as pays, and the message says so. "soft": they enter by the OCP's penalty, and nothing is held.
+        as pays, and the message says so; the cost has the price in it. "soft": they enter by the OCP's penalty, and
+        nothing is held.
     between : bool
         Whether they hold between nodes too, all but exactly: by margins at the nodes, exchanged twice, each time for as
         much as the plan dips between them.
@@ -90,6 +91,7 @@ class DDP:
         self.ocp, self.intervals, self.settings = ocp, int(intervals), settings or DDPSettings()
         self.constraints, self.dynamics, self.cache = constraints, dynamics, cache
         self.between = checks.flag(between, "between", "DDP")
+        self.margin: Array | None = None  # see `inside`
         self.checked = self.coarse = False  # whether the grid was held against the plant, and is too coarse for it
         self.left = substeps is None  # whether the grid was left to nocl
         self.threads = int(threads or os.cpu_count() or 1)
@@ -110,10 +112,19 @@ class DDP:
                              "expected the constraints of its problem: leave `rows` out, or use workers of this one")
         return {"ocp": self.ocp, "intervals": self.intervals, "substeps": self.substeps, "dynamics": self.dynamics,
                 "settings": self.settings, "constraints": self.constraints, "between": self.between,
-                "threads": self.threads, "cache": self.cache}
+                "threads": self.threads, "cache": self.cache, "margin": self.margin}
 
     def __setstate__(self, options: dict[str, Any]) -> None:
+        margin = options.pop("margin")
         DDP.__init__(self, **options)  # the kernel is built, or found in the cache, where it is needed
+        self.margin = margin
+
+    def inside(self, margin: Array) -> DDP:
+        """The same solver, which holds each row further inside, by a share of its scale [rows of a stage, then of the
+        end]."""
+        other = self._with_threads(self.threads)
+        other.margin = np.asarray(margin, dtype=np.float64)
+        return other
 
     def solve(self, x0: ArrayLike, t0: ArrayLike = 0.0, *, u: Array | None = None, x: Array | None = None,
               gain: Array | None = None, p: Any = None, curvature: bool = False,
@@ -186,7 +197,7 @@ class DDP:
         dips = Dips(_functions(self.ocp, self.dynamics), self.rows)
         for _ in range(EXCHANGES):
             t = work.t0[:, None] + work.h[:, None] * np.arange(self.intervals + 1)
-            work.exchange(dips.margins(t, work.x, work.u, work.p))
+            work.exchange(work.with_margin(dips.margins(t, work.x, work.u, work.p)))
 
     def rollout(self, x0: Array, p: Array | None = None, **guess: Array) -> Array:
         """The states [B, K+1, nx] from x0 [B, nx] at t0 = 0 under a guess of `solve`'s: where the descent begins.
@@ -239,7 +250,8 @@ class DDP:
         net = None if self.dynamics is None else self.dynamics.net
         source = ddp_source(self.ocp, net, self.substeps, self.rows if self.held else None)
         return fingerprint(self.ocp.to_data(), source, self._weights, self.intervals, self.settings, self.constraints,
-                           *([self.between] if self.between else []), version("nocl"))
+                           *([self.between] if self.between else []), *([] if self.margin is None else [self.margin]),
+                           version("nocl"))
 
     def _run_key(self, x0: Array, t0: Array, p: Array, guess: dict[str, Array], curvature: bool) -> str:
         """A fingerprint of all that the solution depends on."""

@@ -155,7 +155,7 @@ class NumpyRows:
 
     def __init__(self, ocp: OCP, rows: ConstraintRows) -> None:
         of, p = ocp.functions, parameters(ocp)
-        self.of, self.given = rows, rows.of_x(of.stage.u)
+        self.of, self.u, self.given = rows, of.stage.u, rows.of_x(of.stage.u)
         self._stage = self._functions(of.stage, rows.stage, of.stage.z, p)
         self._end = self._functions(of.end, rows.end, of.end["x"], p)
 
@@ -183,9 +183,14 @@ class NumpyRows:
         kept[:len(self.given)] = ~self.given
         return kept
 
-    def _multiplier(self, c: Array, y: Array, penalty: Array, equal: Mask) -> tuple[Array, Array, Array]:
+    def _own(self, K: int) -> Mask:
+        """The end's rows that are no stage's."""
+        return np.r_[np.zeros(K * len(self.of.stage), dtype=bool), self.of.end_own(self.u)]
+
+    def _multiplier(self, c: Array, y: Array, penalty: Array, equal: Mask, own: Mask) -> tuple[Array, Array, Array]:
         """(q, a, w), [B, rows]."""
-        rho, most, stiff = (penalty[:, [i]] for i in range(3))
+        rho, most, stiff, at_end = (penalty[:, [i]] for i in range(4))
+        most = np.where(own, at_end, most)
         q, least = y - rho * c, np.where(equal, -most, 0.0)
         a = np.clip(q, least, most)
         free, capped = (q > least) & (q < most), (q >= most) | (equal & (q <= least))
@@ -197,7 +202,7 @@ class NumpyRows:
               parts: Array) -> None:
         """J and what is told of the rows from c and the cost."""
         inside, rho = c[b] - (0.0 if margin is None else margin[b]), penalty[b, :1]
-        q, a, _ = self._multiplier(inside, y[b], penalty[b], self._equal(K))
+        q, a, _ = self._multiplier(inside, y[b], penalty[b], self._equal(K), self._own(K))
         e = np.where(q == a, inside, (y[b] - a) / rho) * self._is_row(K)
         psi = np.where(q == a, (0.5 * rho * inside - y[b]) * inside, 0.5 * (a**2 - y[b]**2) / rho + (q - a) * a / rho)
         J[b] = parts[b, 0] + (psi * self._is_row(K)).sum(axis=1)
@@ -208,7 +213,7 @@ class NumpyRows:
         """What the rows at a node add to the gradient and the Hessian in z there, and to dV/dp."""
         part, functions = self._part(K, t), self._end if t == K else self._stage
         c = _rows(functions[0], *at)[0] - (0.0 if margin is None else margin[b, part])
-        _, a, w = self._multiplier(c, y[b, part], penalty[b], self._equal(K)[part])
+        _, a, w = self._multiplier(c, y[b, part], penalty[b], self._equal(K)[part], self._own(K)[part])
         a, w = a * self._is_row(K)[part], w * self._is_row(K)[part]
         slope, curve, by_p = _rows(functions[1], *at, a, w, exact[:, None] * a)
         return slope, curve.reshape(len(b), slope.shape[1], -1), by_p
@@ -217,7 +222,7 @@ class NumpyRows:
                    J: Array, parts: Array) -> None:
         """y becomes a, rho grows by a factor."""
         inside = c[b] - (0.0 if margin is None else margin[b])
-        a = self._multiplier(inside, y[b], penalty[b], self._equal(K))[1]
+        a = self._multiplier(inside, y[b], penalty[b], self._equal(K), self._own(K))[1]
         y[b] = np.where(self._is_row(K), a, y[b])
         penalty[b, 0] *= factor[b]
         self.merit(b, K, J, y, margin, penalty, c, parts)

@@ -55,6 +55,7 @@ class Kernels(Protocol):
     settings: DDPSettings
     constraints: str
     rows: ConstraintRows
+    margin: Array | None  # [rows of a stage, then of the end], by which each is held further inside
     threads: int
     kernel: Kernel | NumpyKernel
     evaluations: Counter[str]

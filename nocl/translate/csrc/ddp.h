@@ -24,7 +24,7 @@
 
    The kernels take d_ [B, ND] behind h_, t at the start of each problem, and nocl_backward one more result, V_p [B, NP].
 
-   A problem with constraints has what rows.h lists. Its kernels take y [B, ROWS], margin [B, ROWS] or NULL and penalty [B, 3] behind
+   A problem with constraints has what rows.h lists. Its kernels take y [B, ROWS], margin [B, ROWS] or NULL and penalty [B, 4] behind
    all else, nocl_rollout also c [B, ROWS] and parts [B, 3] = (cost, sum rho e^2 / 2, max |e|), and its J is the merit, cost + psi.
    Where mu > 0 its sweeps leave out the second derivatives of f and of the rows (Gauss-Newton).
 

@@ -1,5 +1,6 @@
 /* The augmented Lagrangian of a problem's constraints, for ddp.h. Generated before this file: NC and NT, the number of rows at a
-   stage and at the end; whether each is an equality, EQUAL[], END_EQUAL[], and whether a stage's holds no control, OF_X[]; and
+   stage and at the end; whether each is an equality, EQUAL[], END_EQUAL[], whether a stage's holds no control, OF_X[], and whether
+   one at the end is its own, no stage's, END_OWN[]; and
 
    stage_rows(x, u, c), end_rows(x, c)                      c >= 0, or c = 0
    stage_rows_model(x, u, a, w, bent, g, W)                 g = -C'a, W = C'diag(w) C - Hessian of bent'c, in z = (x, u)
@@ -7,25 +8,29 @@
    stage_rows_parameters(x, u, d, a, g), end_rows_parameters(x, d, a, g)    g = -(dc/dp)'a, with parameters
 
    A problem's rows stand in [ROWS]: those of stage k from k NC on, those of the end behind all stages. Each has a multiplier y and
-   a margin (c is less by it; the array may be NULL), and each problem three numbers, penalty [B, 3]: rho, the largest multiplier
-   (infinite where constraints are hard), and, in a sweep for gains, the weight of active rows (else 0).
+   a margin (c is less by it; the array may be NULL), and each problem four numbers, penalty [B, 4]: rho, the largest multiplier
+   (infinite where constraints are hard), in a sweep for gains the weight of active rows (else 0), and the largest multiplier of
+   the end's own rows.
 
    With q = y - rho c the multiplier after this step is a, q cut to [0, largest], or to [-largest, largest] of an equality; what is
    added to the cost is psi, whose slope in c is -a; and e = (y - a) / rho is 0 where c and y fit. */
 #define ROWS (K * NC + NT)
 
-typedef struct { lane rho, largest, stiff, psi, square, worst; } lagrangian;
+typedef struct { lane rho, largest, stiff, at_end, psi, square, worst; } lagrangian;
 
 static lagrangian lagrangian_of(const double *penalty_, const int64_t *at)
 {
-    lagrangian of = {gather(penalty_, at, 3, 0), gather(penalty_, at, 3, 1), gather(penalty_, at, 3, 2)};
+    lagrangian of = {gather(penalty_, at, 4, 0), gather(penalty_, at, 4, 1), gather(penalty_, at, 4, 2), gather(penalty_, at, 4, 3)};
     return of;
 }
 
+/* The largest multiplier of row i of a stage, or of the end. */
+static inline lane largest_of(const lagrangian *of, int end, int i) { return end && END_OWN[i] ? of->at_end : of->largest; }
+
 /* The multiplier a of a row, and its weight in the Hessian: rho where it is free, a little where it is the largest. */
-static lane multiplier(const lagrangian *of, lane c, lane y, int equal, lane *weight)
+static lane multiplier(const lagrangian *of, lane c, lane y, int equal, lane most, lane *weight)
 {
-    const lane q = y - of->rho * c, most = of->largest, least = equal ? -most : (lane){0};
+    const lane q = y - of->rho * c, least = equal ? -most : (lane){0};
     const lane a = where(q < least, least, where(q > most, most, q));
     const mask low = q <= least, free = (q > least) & (q < most), capped = (q >= most) | (equal ? low : (mask){0});
     const mask active = free & (equal ? all_lanes() : a > 1e-16 * of->stiff);
@@ -35,9 +40,9 @@ static lane multiplier(const lagrangian *of, lane c, lane y, int equal, lane *we
 }
 
 /* Adds a row to psi, sum rho e^2 / 2 and max |e|. */
-static void add_row(lagrangian *of, lane c, lane y, int equal)
+static void add_row(lagrangian *of, lane c, lane y, int equal, lane most)
 {
-    const lane q = y - of->rho * c, most = of->largest, least = equal ? -most : (lane){0};
+    const lane q = y - of->rho * c, least = equal ? -most : (lane){0};
     const lane a = where(q < least, least, where(q > most, most, q)), share = 1 / of->rho;
     const mask within = q == a;
     const lane e = where(within, c, (y - a) * share), size = where(e < 0, -e, e);
@@ -61,7 +66,8 @@ static void add_rows(lagrangian *of, const lane *c, const double *y_, const doub
     for (int i = 0; i < n; ++i)
         if (end || is_row(t, i)) {
             const int64_t row = t * NC + i;
-            add_row(of, with_margin(margin_, at, ROWS, row, c[i]), gather(y_, at, ROWS, row), (end ? END_EQUAL : EQUAL)[i]);
+            add_row(of, with_margin(margin_, at, ROWS, row, c[i]), gather(y_, at, ROWS, row), (end ? END_EQUAL : EQUAL)[i],
+                    largest_of(of, end, i));
         }
 }
 
@@ -80,7 +86,7 @@ static void weigh_rows(const lagrangian *of, const lane *c, lane bend, const dou
         a[i] = w[i] = (lane){0};
         if (end || is_row(t, i))
             a[i] = multiplier(of, with_margin(margin_, at, ROWS, row, c[i]), gather(y_, at, ROWS, row),
-                              (end ? END_EQUAL : EQUAL)[i], w + i);
+                              (end ? END_EQUAL : EQUAL)[i], largest_of(of, end, i), w + i);
         bent[i] = bend * a[i];
     }
 }
@@ -102,11 +108,11 @@ void nocl_multipliers(int64_t first, int64_t last, const int64_t *index, int64_t
                 if (t < K && !is_row(t, i)) continue;
                 lane weight;
                 const lane c = with_margin(margin_, at, ROWS, row, gather(c_, at, ROWS, row));
-                const lane a = multiplier(&before, c, gather(y_, at, ROWS, row), equal, &weight);
+                const lane most = largest_of(&before, t == K, i), a = multiplier(&before, c, gather(y_, at, ROWS, row), equal, most, &weight);
                 scatter(y_, at, ROWS, row, a);
-                add_row(&after, c, a, equal);
+                add_row(&after, c, a, equal, most);
             }
-        scatter(penalty_, at, 3, 0, after.rho);
+        scatter(penalty_, at, 4, 0, after.rho);
         scatter(merit_, at, 1, 0, cost + after.psi);
         scatter(parts_, at, 3, 1, after.square);
         scatter(parts_, at, 3, 2, after.worst);

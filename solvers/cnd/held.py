@@ -1,0 +1,101 @@
+"""Constraints in training: which plans are labels, what a policy violates, and the margins that make up for it.
+
+Labels hold the problem's constraints by margins more than they ask for, since a policy's own errors lie about the
+boundary: half of them outside. A margin is what all but SELDOM of held-out runs exceed the boundary by, measured under
+the margins before, row by row. Equations and what the output map holds (projection.py) have none.
+
+Plans are elastic: where a state lies between the margin and the boundary, or a little outside, the label goes back in
+as fast as pays. Where no plan stays within LOST of what is held, the state is lost, and no label.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+
+from nocl.data import Solution
+from nocl.ocp import OCP
+from nocl.solvers.cnd.in_torch import InTorch
+from nocl.solvers.cnd.labels import Policy, Problems, continuous_run
+from nocl.solvers.cnd.projection import projected
+from nocl.solvers.ddp.solver import DDP
+from nocl.support.checks import Array
+
+FIRST = 1e-3  # of a scale, the first margin of each row
+LARGEST = 0.05  # of a scale, the largest
+SELDOM = 0.02  # of held-out runs may exceed what a margin makes up for
+ALLOWED = 1e-3  # of a scale: what is less counts as no violation
+LOST = 0.01  # of a scale: a plan that leaves more is no label
+
+
+@dataclass(frozen=True, eq=False)
+class Held:
+    """A problem's constraints: rows along the trajectory, then those at its end."""
+
+    ocp: OCP
+
+    @property
+    def first(self) -> Array:
+        """The first margins [m + those at the end]."""
+        return np.where(self.inward, FIRST, 0.0)
+
+    @cached_property
+    def inward(self) -> Any:
+        """Which rows have a margin."""
+        of = self.ocp.functions
+        return np.r_[~of.rows.equal & ~projected(self.ocp), ~of.end_rows.equal]
+
+    @cached_property
+    def scales(self) -> Array:
+        of = self.ocp.functions
+        return np.r_[of.scales, of.end_scales]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        of = self.ocp.functions
+        return (*of.rows.names, *of.end_rows.names)
+
+    def solver(self, ddp: DDP, margin: Array) -> DDP:
+        """A DDP whose plans keep these margins."""
+        m, of_x = len(self.ocp.functions.rows), self.ocp.functions.rows.n_x
+        return ddp.inside(np.r_[margin[:m], margin[:of_x], margin[m:]])
+
+    def labels(self, solution: Solution) -> Solution:
+        """The same, without success where a plan leaves what is held after its start by more than LOST."""
+        s, later = solution, slice(1, None)
+        least = self.ocp.least_held(s.x[:, later], s.u[:, later], s.t[:, later], s.parameters)
+        over = self.ocp.violation(least, self.ocp.least_at_end(s.x[:, -1], s.parameters))
+        return replace(s, success=s.success & (over <= LOST))
+
+    def exceeded(self, policy: Policy, torch_ocp: InTorch, at: Problems, steps: int) -> Array:
+        """What the policy exceeds each row by as continuous feedback from there, in scales [B, m + those at the end];
+        less than 0 where it stays inside.
+        """
+        _, x, t = continuous_run(policy, torch_ocp, at, steps)
+        B, nodes = t.shape
+        here, flat = torch_ocp.at(np.repeat(at.p, nodes, axis=0)), torch.from_numpy(x.reshape(B * nodes, -1))
+        with torch.no_grad():
+            u = policy(flat, torch.from_numpy(t.reshape(-1, 1)), *here.p).numpy().reshape(B, nodes, -1)
+        least = np.hstack([self.ocp.least_held(x, u, t, at.p), self.ocp.least_at_end(x[:, -1], at.p)])
+        lost = ~np.isfinite(x[:, -1]).all(axis=1)
+        return np.where(lost[:, None], np.inf, -least / self.scales)
+
+    def next(self, margin: Array, exceeded: Array) -> Array:
+        """The margins for labels of the next round."""
+        if not len(exceeded):
+            return margin
+        more = np.quantile(exceeded, 1 - SELDOM, axis=0, method="higher") - ALLOWED / 2
+        return np.where(self.inward, np.clip(margin + more, 0.0, LARGEST), 0.0)
+
+    def summary(self, exceeded: Array, name: str) -> dict[str, Any]:
+        """The share of runs that violate a constraint, and the worst of each, in scales."""
+        worst = np.maximum(exceeded, 0.0)
+        each: dict[str, float] = {}
+        for row, title in enumerate(self.names):
+            each[title] = max(each.get(title, 0.0), float(worst[:, row].max(initial=0.0)))
+        share = float((worst.max(axis=1, initial=0.0) > ALLOWED).mean()) if len(worst) else float("nan")
+        return {f"{name}_violating": share, f"{name}_worst": each}
