@@ -96,6 +96,24 @@ def _dubins() -> OCP:
                          parameters=_within(bounds), path_constraints={"obstacle": clear})
 
 
+def _sights(ocp: OCP) -> ca.SX:
+    """Features of the car: where goal and obstacle are, seen from the car, and car and obstacle, seen from the goal."""
+    x, heading, centre, radius = ocp.system.x[:2], ocp.system.x[2], ocp.p[:2], ocp.p[2]
+    goal, direction = ocp.p[3:5], ocp.p[5]
+    to_goal, to_obstacle = goal - x, centre - x
+    away, left = (ca.sqrt(ca.sumsqr(way) + 1e-4) for way in (to_obstacle, to_goal))
+    ahead, straight = _turned(to_obstacle, heading), to_goal / left
+    beside = straight[0] * to_obstacle[1] - straight[1] * to_obstacle[0]  # of the straight way to the goal
+    return ca.vertcat(_turned(-to_goal, direction), ca.sin(heading - direction), ca.cos(heading - direction),
+                      _turned(centre - goal, direction), ahead, _turned(to_goal, heading), ahead / away, radius / away,
+                      ca.fmax(-1, ca.fmin(1, ahead[1] / radius)), beside, ca.dot(straight, to_obstacle))
+
+
+def _turned(v: ca.SX, angle: ca.SX) -> ca.SX:
+    """v [2] in axes that are turned by an angle."""
+    return ca.vertcat(ca.cos(angle) * v[0] + ca.sin(angle) * v[1], ca.cos(angle) * v[1] - ca.sin(angle) * v[0])
+
+
 def _pendulum() -> OCP:
     """Swing up to an angle, with another mass."""
     mass, goal = nocl.parameter("mass", 1.0, "kg"), nocl.parameter("goal", 0.0, "rad")
@@ -114,6 +132,9 @@ PROBLEMS: dict[str, tuple[str, Callable[[], OCP]]] = {
     "acrobot-goal": ("acrobot: angle of joint 2, both masses", _acrobot),
     "dubins-obstacle": ("dubins: obstacle, its radius, goal pose", _dubins),
     "pendulum-goal": ("pendulum: goal, mass", _pendulum)}
+
+
+FEATURES: dict[str, Callable[[OCP], ca.SX]] = {"dubins-obstacle": _sights}  # what networks are shown beside nocl's own
 
 
 def drawn(ocp: OCP, n: int, seed: int) -> tuple[Array, Array]:
@@ -196,7 +217,8 @@ class Goals(table.PaperTable[Plan, Cell, Entry]):
         identified = 0.0 if model is None else time.perf_counter() - start
         start, cpu = time.perf_counter(), time.process_time()
         settings = TrainSettings.of(effort, parameters=ocp.np, value=False)
-        cnd = train(ocp, model, seed=place.seed, settings=settings, progress=False)
+        shown = FEATURES[place.problem](ocp) if place.problem in FEATURES else None
+        cnd = train(ocp, model, seed=place.seed, settings=settings, progress=False, features=shown)
         seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
         gap, collisions = judged(place.problem, cnd, plan.n, place.seed)
         return Cell(place.problem, place.way, place.seed, self.key(plan, place), gap.tolist(), collisions, identified,

@@ -31,6 +31,7 @@ ENOUGH = 0.25  # of the last round's violation: if more is left, rho grows
 LEAST, MOST, LARGEST = 1.0, 10.0, 1e7  # usual costs for a violation of one scale: rho at first, and ever
 SHARE = 10.0  # of the guess's cost, what rho makes of its violations at first
 RHO_GROWTH = 4.0
+ROUNDS = 5  # times max_iterations are the most that all rounds together take; one of them takes max_iterations
 STALLS = 2  # rounds at the largest rho in which the violation does not halve: it cannot be held
 PRICE = 100.0  # usual costs for a violation of one scale over the whole horizon, or at its end, if they are elastic
 STIFF = 1e7  # usual costs, the weight of active rows in the sweep for gains
@@ -90,6 +91,7 @@ class Augmented(Work):
         kept = {name: getattr(self, name).copy() for name in KEPT}
         spent, before = self.iterations.copy(), self.margin
         self.margin, self.iterations[:], self.alpha[:] = margin, 0, 0.0
+        self.most[:] = self.ddp.settings.max_iterations
         self.rollout(rows, self.x, self.u, self.gain)  # the same plan, its merit with the margins
         self._take(rows)
         self.state[rows], self.last[rows], self.stalls[rows], self.mu[rows] = RUNNING, np.inf, 0, 0.0
@@ -126,6 +128,11 @@ class Augmented(Work):
         self.state[rows[held]] = CONVERGED
         self._next_round(rows[~held], self.parts[rows[~held], 2] > ENOUGH * self.last[rows[~held]])
 
+    def _stuck(self, rows: Rows) -> None:
+        """If more damping finds nothing to gain either, it is this round's minimum: rounding or a kink hides more."""
+        self.refused[rows] = np.maximum(self.refused[rows], self.mu[rows])
+        super()._stuck(rows)
+
     def _at_saddle(self, rows: Rows) -> None:
         """Held, it is one of the problem; else a larger rho may bend the merit upwards."""
         done = self._held(rows) | (self.penalty[rows, 0] >= LARGEST * self.unit)
@@ -136,11 +143,13 @@ class Augmented(Work):
 
     def _next_round(self, rows: Rows, grows: NDArray[np.bool_]) -> None:
         """y becomes a, and rho grows where it should; gives up what cannot be held."""
-        worst, rho, most = self.parts[rows, 2], self.penalty[rows, 0], LARGEST * self.unit
+        d, worst, rho, most = self.ddp, self.parts[rows, 2], self.penalty[rows, 0], LARGEST * self.unit
         self.stalls[rows] += (rho >= most) & (worst > 0.5 * self.last[rows])
         self.state[rows[self.stalls[rows] >= STALLS]] = NOT_HELD
         self.last[rows] = worst
-        factor, d = np.ones(len(self.x0)), self.ddp
+        once = d.settings.max_iterations
+        self.most[rows] = np.minimum(self.iterations[rows] + once, ROUNDS * once)
+        factor = np.ones(len(self.x0))
         factor[rows] = np.where(grows, np.minimum(RHO_GROWTH, most / rho), 1.0)
         d.kernel("nocl_multipliers", rows, d.intervals, self.margin, self.c, factor, self.y, self.penalty, self.J,
                  self.parts, threads=d.threads)

@@ -92,6 +92,7 @@ class Work:
         self.new_J = np.zeros(B)
         self.slope, self.curve, self.positive = np.zeros(B), np.zeros(B), np.zeros(B)
         self.mu, self.alpha, self.iterations = np.zeros(B), np.zeros(B), np.zeros(B, dtype=np.int64)
+        self.most = np.full(B, self.ddp.settings.max_iterations)
         self.state = np.zeros(B, dtype=np.int64)  # an index of MESSAGES
         self.refused = np.full(B, -1.0)  # the largest mu at which the last sweep's trajectory was not convex
         timed = [self.t0] if ocp.uses_time else []
@@ -128,9 +129,8 @@ class Work:
         return []
 
     def descend(self) -> None:
-        s = self.ddp.settings
         while (rows := np.flatnonzero(self.state == RUNNING)).size:
-            self.state[rows[self.iterations[rows] >= s.max_iterations]] = OUT_OF_ITERATIONS
+            self.state[rows[self.iterations[rows] >= self.most[rows]]] = OUT_OF_ITERATIONS
             rows = rows[self.state[rows] == RUNNING]
             self.iterations[rows] += 1
             self.backward(rows)
@@ -186,8 +186,12 @@ class Work:
             rows = rows[~done]
             self.alpha[rows] /= 2
             stuck = self.alpha[rows] < self.ddp.settings.smallest_step
-            self._damp(rows[stuck])
+            self._stuck(rows[stuck])
             rows = rows[~stuck]
+
+    def _stuck(self, rows: Rows) -> None:
+        """No step along what the sweep says lowers J."""
+        self._damp(rows)
 
     def _damp(self, rows: Rows) -> None:
         s = self.ddp.settings
