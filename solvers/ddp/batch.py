@@ -21,7 +21,7 @@ BYTES = 2**28  # ... and what its trajectories, gains and curvatures take at mos
 class Descent(Protocol):
     """What solves a piece of a batch."""
 
-    ocp: OCP
+    posed: OCP
     intervals: int
     held: int
 
@@ -80,7 +80,7 @@ class Job:
 
 def bytes_each(ddp: Descent, curvature: bool) -> int:
     """What one problem takes while it is solved."""
-    K, nx, nu = ddp.intervals, ddp.ocp.system.nx, ddp.ocp.system.nu
+    K, nx, nu = ddp.intervals, ddp.posed.system.nx, ddp.posed.system.nu
     return 8 * (K + 1) * (4 * nx + 4 * nu + 2 * nu * nx + 3 + (nx * nx if curvature else 0)) + 8 * 6 * ddp.held
 
 
