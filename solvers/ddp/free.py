@@ -22,7 +22,7 @@ from nocl.ocp import OCP
 from nocl.parameters import time
 from nocl.sampling import Distribution, Gaussian, Uniform
 from nocl.scales import units
-from nocl.solvers.ddp.augmented import KEPT, Augmented
+from nocl.solvers.ddp.augmented import KEPT, LARGEST, Augmented
 from nocl.solvers.ddp.batch import Rows
 from nocl.solvers.starts import middle
 from nocl.support.checks import Array
@@ -30,6 +30,7 @@ from nocl.system import System
 
 FASTER, SLOWER = 0.5, 1.0  # shares of T by which a step may shorten and lengthen it: half, and twice as long
 FAR = 0.01  # of a scale: while a constraint is off by more, T grows only: in a shorter time less can be held
+DEARER = 10.0  # rho in a longer time, so that what was given up for a shorter one is not given up again
 FLAT = 1e-9  # of the largest V_TT along a plan: below it, T is not found by what is left of the plan
 
 
@@ -135,7 +136,7 @@ class FreeTime(Augmented):
 
     def _next_round(self, rows: Rows, grows: NDArray[np.bool_]) -> None:
         """What does not come nearer to its constraints has too little time: first it gets more."""
-        short = grows & (self.parts[rows, 2] > FAR) & (self.T[rows] < self.high)
+        short = (self.parts[rows, 2] > 0.5 * self.last[rows]) & (self.parts[rows, 2] > FAR) & (self.T[rows] < self.high)
         self._lengthen(rows[short])
         super()._next_round(rows[~short], grows[~short])
 
@@ -144,6 +145,7 @@ class FreeTime(Augmented):
         if not rows.size:
             return
         self.k[rows], self.gain[rows], self.y[rows] = 0.0, 0.0, 0.0
+        self.penalty[rows, 0] = np.minimum(DEARER * self.penalty[rows, 0], LARGEST * self.unit)
         self.dT[rows], self.alpha[rows] = SLOWER * self.T[rows], 1.0
         self.rollout(rows, self.x, self.u, self.gain)
         self._take(rows)
