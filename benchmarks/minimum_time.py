@@ -155,7 +155,7 @@ def main() -> None:
         if args.beside:
             rows[name]["nmpc"] = nmpc_row(case, best[:args.beside], args.nmpc_starts)
             print(f"  nmpc: {rows[name]['nmpc']}", flush=True)
-    if args.states >= 100: provenance.write("minimum_time", rows)
+    provenance.write("minimum_time", rows)
 
 
 if __name__ == "__main__":

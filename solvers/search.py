@@ -66,7 +66,7 @@ class Moves:
         return Moves(*(np.concatenate([getattr(m, f.name) for m in moves]) for f in fields(Moves)))
 
 
-Guess = dict[str, Array]  # x [n, K+1, nx], u [n, K, nu], gain [n, K, nu, nx] and, of free horizons, t [n, K+1] of n moves
+Guess = dict[str, Array]  # x [n, K+1, nx], u [n, K, nu], gain [n, K, nu, nx] of n moves; t [n, K+1] of free horizons
 
 
 class Solver(Protocol):

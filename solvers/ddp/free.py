@@ -156,19 +156,20 @@ class FreeTime(Augmented):
 
     def _found(self) -> NDArray[np.bool_]:
         """Where T lies between its bounds."""
-        return np.asarray((self.T > self.low) & (self.T < self.high))
+        inside = (self.low < self.T) & (self.T < self.high)
+        return np.asarray(inside)
 
 
 def unlifted(s: Solution, found: NDArray[np.bool_], curvature: bool) -> Solution:
     """A lifted problem's solution as one of the problem itself: each row has the nodes t of its own T.
 
-    gain and V_xx are those with the horizon found anew from each node on (where `found` [B] says that T is no bound):
-    of what is left of the plan, T - T V_Tx (x - x_k) / V_TT is best.
+    gain and V_xx are those where the horizon is found anew from each node on (where `found` [B] says that T is no bound):
+    of what is left of the plan, T - V_Tx (x - x_k) / V_TT is best.
     """
     assert s.V_xx is not None
-    V_TT = s.V_xx[..., -1, -1]
-    firm = found[:, None] & (V_TT > FLAT * np.abs(V_TT).max(axis=1, keepdims=True))
-    moves = np.where(firm[..., None], -s.V_xx[..., -1, :-1] / np.where(firm, V_TT, 1.0)[..., None], 0.0)  # dT/dx
+    bent = s.V_xx[..., -1, -1]
+    firm = found[:, None] & (bent > FLAT * np.abs(bent).max(axis=1, keepdims=True))
+    moves = np.where(firm[..., None], -s.V_xx[..., -1, :-1] / np.where(firm, bent, 1.0)[..., None], 0.0)  # dT/dx
     gain = s.gain[..., :-1] + s.gain[..., -1:] * moves[:, :-1, None, :]
     V_xx = s.V_xx[..., :-1, :-1] + s.V_xx[..., :-1, -1:] * moves[..., None, :]
     return replace(s, t=s.t * s.x[:, :1, -1], x=np.ascontiguousarray(s.x[..., :-1]), gain=gain,

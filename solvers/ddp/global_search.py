@@ -208,7 +208,8 @@ class _States:
         if number == 1:
             return self.holds.goal(self.p[rows[at]])
         if number % 2:
-            return self._tamed(rows[at], {"u": random_controls(ddp.ocp, ddp.intervals, n, rng, self.p[rows[at]]), **times})
+            u = random_controls(ddp.ocp, ddp.intervals, n, rng, self.p[rows[at]])
+            return self._tamed(rows[at], {"u": u, **times})
         return self._tamed(rows[at], {**self.holds.random(self.p[rows[at]], rng), **times})
 
     def _tamed(self, states: Rows, guess: Guess) -> Guess:

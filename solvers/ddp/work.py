@@ -105,8 +105,8 @@ class Work:
     def rollout(self, rows: Rows, x_bar: Array, u_bar: Array, gain: Array) -> None:
         d = self.ddp
         d.evaluations["rollout"] += STAGES * d.substeps * d.intervals * len(rows)
-        d.kernel("nocl_rollout", rows, d.intervals, d._weights, d._lb, d._ub, self.h, *self.data, self._start(), x_bar, u_bar,
-                 self.k, gain, self.alpha, self.new_x, self.new_u, self.new_J, *self._held_in(), *self._held_out(),
+        d.kernel("nocl_rollout", rows, d.intervals, d._weights, d._lb, d._ub, self.h, *self.data, self._start(), x_bar,
+                 u_bar, self.k, gain, self.alpha, self.new_x, self.new_u, self.new_J, *self._held_in(), *self._held_out(),
                  threads=d.threads)
 
     def _start(self) -> Array:
