@@ -21,7 +21,8 @@ BYTES = 2**28  # ... and what its trajectories, gains and curvatures take at mos
 class Descent(Protocol):
     """What solves a piece of a batch."""
 
-    posed: OCP
+    ocp: OCP
+    posed: OCP  # what the kernel solves
     intervals: int
     held: int
 
@@ -81,7 +82,7 @@ class Job:
 def bytes_each(ddp: Descent, curvature: bool) -> int:
     """What one problem takes while it is solved."""
     K, nx, nu = ddp.intervals, ddp.posed.system.nx, ddp.posed.system.nu
-    return 8 * (K + 1) * (4 * nx + 4 * nu + 2 * nu * nx + 3 + (nx * nx if curvature else 0)) + 8 * 6 * ddp.held
+    return 8 * (K + 1) * (4 * nx + 4 * nu + 2 * nu * nx + 3 + (nx * nx if curvature or ddp.ocp.is_free else 0)) + 8 * 6 * ddp.held
 
 
 def pieces(ddp: Descent, x0: Array, t0: Array, guess: dict[str, Array], curvature: bool,

@@ -156,15 +156,14 @@ class FreeTime(Augmented):
 
     def _found(self) -> NDArray[np.bool_]:
         """Where T lies between its bounds."""
-        inside = (self.low < self.T) & (self.T < self.high)
-        return np.asarray(inside)
+        return np.asarray((self.low < self.T) & (self.high > self.T))
 
 
 def unlifted(s: Solution, found: NDArray[np.bool_], curvature: bool) -> Solution:
     """A lifted problem's solution as one of the problem itself: each row has the nodes t of its own T.
 
-    gain and V_xx are those where the horizon is found anew from each node on (where `found` [B] says that T is no bound):
-    of what is left of the plan, T - V_Tx (x - x_k) / V_TT is best.
+    gain and V_xx are those where the horizon is found anew from each node on, if `found` [B] says that T is no bound:
+    for what is left of the plan T - V_Tx (x - x_k) / V_TT is best.
     """
     assert s.V_xx is not None
     bent = s.V_xx[..., -1, -1]

@@ -106,8 +106,8 @@ class Work:
         d = self.ddp
         d.evaluations["rollout"] += STAGES * d.substeps * d.intervals * len(rows)
         d.kernel("nocl_rollout", rows, d.intervals, d._weights, d._lb, d._ub, self.h, *self.data, self._start(), x_bar,
-                 u_bar, self.k, gain, self.alpha, self.new_x, self.new_u, self.new_J, *self._held_in(), *self._held_out(),
-                 threads=d.threads)
+                 u_bar, self.k, gain, self.alpha, self.new_x, self.new_u, self.new_J, *self._held_in(),
+                 *self._held_out(), threads=d.threads)
 
     def _start(self) -> Array:
         """The states [B, nx] that rollouts begin at."""
