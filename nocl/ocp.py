@@ -456,7 +456,7 @@ class OCP:
         """ValueError for a free horizon."""
         if self.is_free:
             raise ValueError(f"{owner} takes a number as horizon, but that of the problem on {self.system.name!r} is "
-                             f"{self.horizon!r}: solve it by NMPC, or give it one, dataclasses.replace(ocp, "
+                             f"{self.horizon!r}: solve it by NMPC or DDP, or give it one, dataclasses.replace(ocp, "
                              f"horizon={self.horizon.high:g})")
 
     def without(self, *names: str) -> OCP:

@@ -66,7 +66,7 @@ class Moves:
         return Moves(*(np.concatenate([getattr(m, f.name) for m in moves]) for f in fields(Moves)))
 
 
-Guess = dict[str, Array]  # x [n, K+1, nx], u [n, K, nu] and gain [n, K, nu, nx] of n moves
+Guess = dict[str, Array]  # x [n, K+1, nx], u [n, K, nu], gain [n, K, nu, nx] of n moves; t [n, K+1] of free horizons
 
 
 class Solver(Protocol):
@@ -176,10 +176,11 @@ class Search:
         return np.flatnonzero((self.rng.random(len(self.x0)) < SHARE) | seldom)
 
     def guess(self, moves: Moves) -> Guess:
-        """What the moves start from, on the search's own nodes."""
+        """What the moves start from, on the search's own nodes, or where the horizon is free on what is left of the
+        parent's."""
         t, start, begin = self.t, self.t[0], moves.begin[:, None]
-        part = (t - start) / (t[-1] - start)
-        times = np.where(moves.held[:, None], np.minimum(begin + t - start, t[-1]), begin + (t[-1] - begin) * part)
+        part, held = (t - start) / (t[-1] - start), moves.held[:, None] & (not self.ocp.is_free)
+        times = np.where(held, np.minimum(begin + t - start, t[-1]), begin + (t[-1] - begin) * part)
         row, s = moves.parent[:, None], self.best
         k, between = self._interval(times[:, :-1] + np.diff(times) / 2), self._interval(times)
         share = ((times - t[between]) / np.diff(t)[between])[..., None]
@@ -188,7 +189,10 @@ class Search:
             at = moves.image == i
             x[at], u[at] = mirrored(self.ocp, mirror, x[at], u[at], self.p[moves.parent[at]])
             gain[at] *= mirror[1][:, None] * mirror[0]
-        return {"x": x, "u": u, "gain": gain}
+        if not self.ocp.is_free:
+            return {"x": x, "u": u, "gain": gain}
+        left = s.t[moves.parent, -1:] * (1 - (begin - start) / (t[-1] - start))
+        return {"x": x, "u": u, "gain": gain, "t": np.clip(left, self.ocp.horizon.low, self.ocp.horizon.high) * part}
 
     def _interval(self, times: Array) -> Rows:
         return np.clip(np.searchsorted(self.t, times, side="right") - 1, 0, len(self.t) - 2)

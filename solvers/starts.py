@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from nocl.constraints import Free
 from nocl.ocp import OCP
 from nocl.sampling import Seed
 from nocl.support.checks import Array
@@ -41,3 +42,20 @@ def near(system: System, x: Array) -> Array:
     middle = (system.lbx + system.ubx) / 2
     far = FAR * np.maximum(system.ubx - system.lbx, np.abs(x[..., :1, :] - middle))
     return np.asarray((np.abs(x - middle) < far).all(axis=(-2, -1)))
+
+
+def middle(horizon: Free) -> float:
+    """A middling horizon."""
+    return float(np.sqrt(horizon.low * horizon.high))
+
+
+def spread_horizon(horizon: Free, number: int) -> float:
+    """The horizon of start number 0, 1, 2, ...: evenly spread, of a logarithmic scale, a middling one first."""
+    share = _spread(number)
+    return float(horizon.low ** (1 - share) * horizon.high**share)
+
+
+def _spread(number: int) -> float:
+    """1/2, 1/4, 3/4, 1/8, 5/8, ...: the numbers from 1 on, their binary digits behind the point in reverse."""
+    digits = bin(number + 1)[2:]
+    return sum(2.0 ** -(i + 1) for i, digit in enumerate(reversed(digits)) if digit == "1")

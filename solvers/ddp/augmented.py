@@ -12,6 +12,7 @@ Multiplier Methods (1982), ch. 2 and 3, the inequalities' multipliers and the up
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,14 +45,16 @@ class Augmented(Work):
 
     y: Array = field(init=False)  # [B, rows of a plan], multipliers
     margin: Array | None = None  # [B, rows of a plan], by which each is held further inside
+    kept: ClassVar[tuple[str, ...]] = KEPT
+    first: ClassVar[tuple[float, float]] = (LEAST, MOST)  # usual costs: rho at first
 
     def __post_init__(self) -> None:
         d, B = self.ddp, len(self.x0)
-        self.unit = usual_sizes(d.ocp).cost
+        self.unit = usual_sizes(d.posed).cost
         self.y, self.c, self.new_c = (np.zeros((B, d.rows.count(d.intervals))) for _ in range(3))
         self.penalty = np.zeros((B, 4))  # rho, largest multiplier, weight in a sweep for gains, largest one at the end
         self.penalty[:, 0] = self.unit
-        share = (d.ocp.horizon - self.t0) / d.ocp.horizon
+        share = (d.posed.horizon - self.t0) / d.posed.horizon
         elastic = d.constraints == "elastic"
         self.penalty[:, 1] = PRICE * self.unit * share / d.intervals if elastic else np.inf
         self.penalty[:, 3] = PRICE * self.unit if elastic else np.inf
@@ -62,15 +65,16 @@ class Augmented(Work):
         super().__post_init__()
         self._first_penalty()
         if d.constraints == "hard":
-            outside = self._violations()[1].max(axis=1) > TOLERATED
+            outside = self._violations()[1].max(axis=1, initial=0.0) > TOLERATED
             self.state[outside & (self.state == RUNNING)] = OUTSIDE
 
     def _first_penalty(self) -> None:
         """rho so that the guess's violations weigh as much as its cost, in bounds."""
+        least, most = (size * self.unit for size in self.first)
         cost, violation = np.abs(self.parts[:, 0]), self.parts[:, 1] / self.penalty[:, 0]
         with np.errstate(all="ignore"):
-            rho = np.clip(SHARE * cost / violation, LEAST * self.unit, MOST * self.unit)
-        rho[~np.isfinite(rho)] = MOST * self.unit  # nothing is violated
+            rho = np.clip(SHARE * cost / violation, least, most)
+        rho[~np.isfinite(rho)] = most  # nothing is violated
         growth = rho / self.penalty[:, 0]
         self.J[:] = self.parts[:, 0] + growth * (self.J - self.parts[:, 0])  # with y = 0 psi is proportional to rho
         self.penalty[:, 0], self.parts[:, 1] = rho, growth * self.parts[:, 1]
@@ -82,13 +86,13 @@ class Augmented(Work):
             return margin
         n = len(d.rows.stage)
         own = np.r_[np.tile(d.margin[:n], d.intervals), d.margin[n:]]
-        own[:n][d.rows.of_x(d.ocp.functions.arguments["u"])] = 0.0
+        own[:n][d.rows.of_x(d.posed.functions.arguments["u"])] = 0.0
         return margin + own
 
     def exchange(self, margin: Array) -> None:
         """Solves what converged again, held further inside by margins [B, rows]; what cannot be, stays as it was."""
         rows = np.flatnonzero(self.state == CONVERGED)
-        kept = {name: getattr(self, name).copy() for name in KEPT}
+        kept = {name: getattr(self, name).copy() for name in self.kept}
         spent, before = self.iterations.copy(), self.margin
         self.margin, self.iterations[:], self.alpha[:] = margin, 0, 0.0
         self.most[:] = self.ddp.settings.max_iterations
@@ -170,11 +174,11 @@ class Augmented(Work):
 
     def _messages(self, t: Array) -> list[str]:
         message = super()._messages(t)
-        (over, given), words = self._violations(), self.ddp.ocp.at_p
+        (over, given), words = self._violations(), self.ddp.posed.at_p
         for i in np.flatnonzero(self.state == OUTSIDE):
             name, where = self._worst(given[i])
             message[i] = f"infeasible: the initial state itself violates {name!r}{words(self.p[i])}, {where}: move it"
-        told = (over.max(axis=1) > TOLD) & (self.state != OUTSIDE) & (self.state != BLEW_UP)
+        told = (over.max(axis=1, initial=0.0) > TOLD) & (self.state != OUTSIDE) & (self.state != BLEW_UP)
         for i in np.flatnonzero(told):
             name, where = self._worst(over[i])
             if self.state[i] in (NOT_HELD, NO_DESCENT):
@@ -190,7 +194,7 @@ class Augmented(Work):
         rows, K = self.ddp.rows, self.ddp.intervals
         equal = np.r_[np.tile(rows.stage.equal, K), rows.end.equal]
         over = np.nan_to_num(np.where(equal, np.abs(self.c), np.maximum(-self.c, 0.0)))
-        fixed = rows.of_x(self.ddp.ocp.functions.arguments["u"])
+        fixed = rows.of_x(self.ddp.posed.functions.arguments["u"])
         given = np.zeros_like(over)
         given[:, :len(fixed)][:, fixed] = over[:, :len(fixed)][:, fixed]
         return over - given, given

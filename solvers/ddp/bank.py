@@ -39,6 +39,7 @@ class SolutionBank:
     @staticmethod
     def of(ddp: DDP, solution: Solution) -> SolutionBank:
         """A bank of the solutions that succeeded; states are compared in units of their spread along them."""
+        ddp.ocp.refuse_free("SolutionBank")
         if (solution.t[:, 0] != 0).any():
             raise ValueError(f"a bank holds solutions from t0 = 0; got t0 up to {solution.t[:, 0].max():g}: solve them "
                              "from t0 = 0")

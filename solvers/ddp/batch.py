@@ -22,6 +22,7 @@ class Descent(Protocol):
     """What solves a piece of a batch."""
 
     ocp: OCP
+    posed: OCP  # what the kernel solves
     intervals: int
     held: int
 
@@ -80,8 +81,9 @@ class Job:
 
 def bytes_each(ddp: Descent, curvature: bool) -> int:
     """What one problem takes while it is solved."""
-    K, nx, nu = ddp.intervals, ddp.ocp.system.nx, ddp.ocp.system.nu
-    return 8 * (K + 1) * (4 * nx + 4 * nu + 2 * nu * nx + 3 + (nx * nx if curvature else 0)) + 8 * 6 * ddp.held
+    bends = curvature or ddp.ocp.is_free  # a free horizon is found by V_xx
+    K, nx, nu = ddp.intervals, ddp.posed.system.nx, ddp.posed.system.nu
+    return 8 * (K + 1) * (4 * nx + 4 * nu + 2 * nu * nx + 3 + (nx * nx if bends else 0)) + 8 * 6 * ddp.held
 
 
 def pieces(ddp: Descent, x0: Array, t0: Array, guess: dict[str, Array], curvature: bool,

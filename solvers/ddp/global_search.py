@@ -29,7 +29,7 @@ from nocl.solvers.ddp.batch import bytes_each
 from nocl.solvers.ddp.solver import DDP
 from nocl.solvers.mirrors import Mirror, mirrors
 from nocl.solvers.search import Found, Guess, Moves, Rows, Search
-from nocl.solvers.starts import HALVINGS, near, random_controls, smooth
+from nocl.solvers.starts import HALVINGS, near, random_controls, smooth, spread_horizon
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
@@ -72,7 +72,7 @@ def solve_globally(ddp: DDP, x0: ArrayLike, *, p: Any = None, starts: int = 16, 
     key = "" if out is None else fingerprint(ddp.key, rows, number, (starts, neighbours, rounds),
                                              *([] if known is None else [known.u]), *([values] if ddp.ocp.np else []))
     states = _States(ddp, rows, values, number, workers, folder, sys.stderr.isatty() if progress is None else progress)
-    t = np.linspace(0, ddp.ocp.horizon, ddp.intervals + 1)
+    t = np.linspace(0, ddp.ocp.longest, ddp.intervals + 1)  # of a free horizon shares alone count
     search = _Kept(states, mirrors(ddp.ocp, ddp.dynamics), t, folder, key, report, neighbours=neighbours,
                    rounds=rounds, seed=number, known=known, p=values)
     for start in range(starts):
@@ -194,15 +194,23 @@ class _States:
         yield from self._solve(moves.row, lambda at: guess(moves[at]))
 
     def _start(self, rows: Rows, number: int, rng: np.random.Generator, at: slice) -> Guess:
-        """A cold start of a part of these states: u held at u*, the goal held, equilibria held, or random controls."""
+        """A cold start of a part of these states, where the horizon is free each with another one."""
+        free, K = self.ddp.ocp.is_free, self.ddp.intervals
+        nodes = np.linspace(0.0, spread_horizon(self.ddp.ocp.horizon, number), K + 1) if free else np.zeros(0)
+        times = {"t": np.tile(nodes, (len(rows[at]), 1))} if free else {}
+        return self._control(rows, number, rng, at, times) | times
+
+    def _control(self, rows: Rows, number: int, rng: np.random.Generator, at: slice, times: Guess) -> Guess:
+        """u held at u*, the goal held, equilibria held, or random controls; times: nodes t, of a free horizon."""
         ddp, n = self.ddp, len(rows[at])
         if number == 0:
             return {}
         if number == 1:
             return self.holds.goal(self.p[rows[at]])
         if number % 2:
-            return self._tamed(rows[at], {"u": random_controls(ddp.ocp, ddp.intervals, n, rng, self.p[rows[at]])})
-        return self._tamed(rows[at], self.holds.random(self.p[rows[at]], rng))
+            u = random_controls(ddp.ocp, ddp.intervals, n, rng, self.p[rows[at]])
+            return self._tamed(rows[at], {"u": u, **times})
+        return self._tamed(rows[at], {**self.holds.random(self.p[rows[at]], rng), **times})
 
     def _tamed(self, states: Rows, guess: Guess) -> Guess:
         """A guess, its controls moved towards u* until the rollout stays near X."""
@@ -304,7 +312,7 @@ def settled(ocp: OCP, z: Array, p: Array, dynamics: Any = None) -> tuple[Array, 
         return z, ~fine
     low, high = np.r_[s.lbx, s.lbu], np.r_[s.ubx, s.ubu]
     of, half = ocp.functions.on(dynamics_function(ocp, dynamics)), (high - low) / 2
-    rate = half[:s.nx] / ocp.horizon  # what 1 stands for in f; half the box in z
+    rate = half[:s.nx] / ocp.longest  # what 1 stands for in f; half the box in z
 
     def linear(rows: Rows) -> tuple[Array, Array]:
         x, u = np.split(z[rows], [s.nx], axis=1)

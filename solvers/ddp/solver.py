@@ -30,10 +30,12 @@ from nocl.solvers.ddp.augmented import Augmented
 from nocl.solvers.ddp.batch import Job, Piece, assembled, pieces
 from nocl.solvers.ddp.between import EXCHANGES, Dips
 from nocl.solvers.ddp.constraints import ConstraintRows, rows_of
+from nocl.solvers.ddp.free import FreeTime, lifted, with_horizons
 from nocl.solvers.ddp.kernel import ddp_source, pack_weights
 from nocl.solvers.ddp.without_compiler import ddp_kernel
 from nocl.solvers.ddp.work import GROWTH, DDPSettings, Work
 from nocl.solvers.grid import fastest_at_start, firsts, followed, measured
+from nocl.solvers.starts import middle
 from nocl.substeps import COARSE, Grid, settled
 from nocl.support import checks
 from nocl.support.checks import Array
@@ -85,10 +87,12 @@ class DDP:
         checks.word(constraints, ("hard", "elastic", "soft"), "constraints", "DDP")
         if constraints == "soft":
             ocp.refuse_constraints("DDP with constraints='soft'", "take constraints='hard', or solve it by NMPC")
-        ocp.refuse_free("DDP")
+        if dynamics is not None:
+            ocp.refuse_free("DDP on learned dynamics")
         if settings is not None:
             checks.instance(DDPSettings, settings, "settings", "DDP", "DDPSettings(max_iterations=...)")
         self.ocp, self.intervals, self.settings = ocp, int(intervals), settings or DDPSettings()
+        self.posed = lifted(ocp) if ocp.is_free else ocp  # what the kernel solves
         self.constraints, self.dynamics, self.cache = constraints, dynamics, cache
         self.between = checks.flag(between, "between", "DDP")
         self.margin: Array | None = None  # see `inside`
@@ -100,11 +104,16 @@ class DDP:
         self._weights = np.zeros(1) if net is None else pack_weights(net)
         self.substeps = int(substeps or substeps_for(ocp, dynamics, self.intervals))
         self._own_rows = rows is not None
-        given = rows_of(ocp) if rows is None else rows
+        given = rows_of(self.posed) if rows is None else rows
         self.rows = ConstraintRows() if constraints == "soft" else given
         self.held = self.rows.count(self.intervals)  # how many rows a plan has that multipliers hold
-        self.kernel = ddp_kernel(ocp, dynamics, cache, self.substeps, self.rows if self.held else None)
+        self.kernel = ddp_kernel(self.posed, dynamics, cache, self.substeps, self._multiplied)
         self._lb, self._ub = np.ascontiguousarray(ocp.system.lbu), np.ascontiguousarray(ocp.system.ubu)
+
+    @property
+    def _multiplied(self) -> ConstraintRows | None:
+        """The rows that multipliers hold, none or not; None where the kernel knows of no such rows."""
+        return self.rows if self.held or self.ocp.is_free else None
 
     def __getstate__(self) -> dict[str, Any]:
         if self._own_rows:
@@ -127,7 +136,7 @@ class DDP:
         return other
 
     def solve(self, x0: ArrayLike, t0: ArrayLike = 0.0, *, u: Array | None = None, x: Array | None = None,
-              gain: Array | None = None, p: Any = None, curvature: bool = False,
+              gain: Array | None = None, t: Array | None = None, p: Any = None, curvature: bool = False,
               workers: int | str = "auto", out: str | os.PathLike[str] | None = None,
               progress: bool | None = None) -> Solution:
         """Descend from a guess u [B, K, nu] (default u*), followed with u + gain (x' - x) where x and gain are given.
@@ -135,7 +144,8 @@ class DDP:
         Parameters
         ----------
         x0 : [nx] or [B, nx]
-        t0 : number or [B], each < horizon
+        t0 : number or [B], each < horizon; 0 where that is free
+        t : nodes [B, K+1] of the guess, whose last one says its horizon; where that is free, default: a middling one
         p : parameters, where the problem has them: [np] for all, [B, np], or by name (OCP.parameters_of)
         curvature : whether to return V_xx
         workers : "auto" (this process, `threads` of it), a number of threads, or "tcp://...", a Dask scheduler
@@ -151,7 +161,7 @@ class DDP:
         values = self.ocp.parameters_of(p, len(rows), "DDP")
         curvature = checks.flag(curvature, "curvature", "DDP.solve")
         times, (pool, here) = self._start_times(t0, len(rows)), self._where(workers)
-        guess = self._guesses(len(rows), u=u, x=x, gain=gain)
+        guess = self._guesses(len(rows), u=u, x=x, gain=gain, t=t)
         journal = Journal(None if out is None else Path(out),
                           self._run_key(rows, times, values, guess, curvature) if out else "", "DDP")
         show = sys.stderr.isatty() if progress is None else progress
@@ -172,8 +182,7 @@ class DDP:
 
     def descend(self, batch: Piece) -> Solution:
         """Solve one piece of a batch, here."""
-        given = batch.guess.get
-        work = self._work(batch.x0, batch.t0, given("u"), given("x"), given("gain"), batch.p)
+        work = self._work(batch.x0, batch.t0, batch.guess, batch.p)
         work.descend()
         if self.between and isinstance(work, Augmented):
             self._exchange(work)
@@ -186,15 +195,15 @@ class DDP:
         brief.settings = replace(self.settings, max_iterations=iterations)
         cost, controls = np.empty(len(x0)), np.empty((len(x0), self.intervals, self.ocp.system.nu))
         for batch in pieces(brief, x0, self._start_times(t0, len(x0)), self._guesses(len(x0), **guess), False, p):
-            given, here = batch.guess.get, slice(batch.first, batch.first + batch.size)
-            work = brief._work(batch.x0, batch.t0, given("u"), given("x"), given("gain"), batch.p)
+            work = brief._work(batch.x0, batch.t0, batch.guess, batch.p)
             work.descend()
+            here = slice(batch.first, batch.first + batch.size)
             cost[here], controls[here] = work.J, work.u
         return cost, controls
 
     def _exchange(self, work: Augmented) -> None:
         """Hold constraints between nodes, by margins at them."""
-        dips = Dips(_functions(self.ocp, self.dynamics), self.rows)
+        dips = Dips(_functions(self.posed, self.dynamics), self.rows)
         for _ in range(EXCHANGES):
             t = work.t0[:, None] + work.h[:, None] * np.arange(self.intervals + 1)
             work.exchange(work.with_margin(dips.margins(t, work.x, work.u, work.p)))
@@ -204,16 +213,15 @@ class DDP:
 
         p [B, np], where the problem has parameters.
         """
-        given = self._guesses(len(x0), **guess).get
-        work = self._work(np.ascontiguousarray(x0), np.zeros(len(x0)), given("u"), given("x"), given("gain"), p)
-        return work.x
+        given = self._guesses(len(x0), **guess)
+        return self._work(np.ascontiguousarray(x0), np.zeros(len(x0)), given, p).x[..., :self.ocp.system.nx]
 
     def feedback(self, x: Array, u: Array, p: Array | None = None) -> Array:
         """Gains [B, K, nu, nx] of one sweep about x [B, K+1, nx], u [B, K, nu]: those of the OCP's cost, damped until
         it is convex there; 0 where no damping helps. p [B, np], where the problem has parameters."""
         B, s = len(x), self.settings
-        work = self._work(np.ascontiguousarray(x[:, 0]), np.zeros(B), None, None, None, p)
-        work.x[:], work.u[:] = x, u
+        work = self._work(np.ascontiguousarray(x[:, 0]), np.zeros(B), {}, p)
+        work.x[..., :x.shape[2]], work.u[:] = x, u
         rows = np.arange(B)
         while rows.size:
             work.backward(rows)
@@ -221,11 +229,15 @@ class DDP:
             work.mu[rows] = np.maximum(GROWTH * work.mu[rows], s.damping)
             work.gain[rows] = 0.0
             rows = rows[work.mu[rows] <= s.largest_damping]
-        return work.gain
+        return work.gain[..., :x.shape[2]]
 
-    def _work(self, x0: Array, t0: Array, u: Array | None, x: Array | None, gain: Array | None,
-              p: Array | None) -> Work:
-        return (Augmented if self.held else Work)(self, x0, t0, u, x, gain, p)
+    def _work(self, x0: Array, t0: Array, guess: dict[str, Array], p: Array | None) -> Work:
+        u, x, gain = (guess.get(name) for name in ("u", "x", "gain"))
+        if not self.ocp.is_free:
+            return (Augmented if self.held else Work)(self, x0, t0, u, x, gain, p)
+        T = guess["t"][:, -1] if "t" in guess else np.full(len(x0), middle(self.ocp.horizon))
+        gain = None if gain is None else np.concatenate([gain, np.zeros_like(gain[..., :1])], axis=-1)
+        return FreeTime(self, with_horizons(x0, T), t0, u, None if x is None else with_horizons(x, T), gain, p)
 
     def _where(self, workers: int | str) -> tuple[Pool, DDP]:
         """The pool, and the DDP that works in it: on a cluster each worker's threads have pieces of their own."""
@@ -241,14 +253,27 @@ class DDP:
 
     def _guesses(self, B: int, **given: Array | None) -> dict[str, Array]:
         K, nx, nu = self.intervals, self.ocp.system.nx, self.ocp.system.nu
-        shapes = {"u": (B, K, nu), "x": (B, K + 1, nx), "gain": (B, K, nu, nx)}
-        return {name: _shaped(value, shapes[name], name) for name, value in given.items() if value is not None}
+        shapes = {"u": (B, K, nu), "x": (B, K + 1, nx), "gain": (B, K, nu, nx), "t": (B, K + 1)}
+        found = {name: _shaped(value, shapes[name], name) for name, value in given.items() if value is not None}
+        if "t" in found:
+            self._check_nodes(found["t"])
+        return found
+
+    def _check_nodes(self, t: Array) -> None:
+        """ValueError for a guess's nodes where the horizon is a number, or that end outside its bounds."""
+        horizon = self.ocp.horizon
+        if not self.ocp.is_free:
+            raise ValueError(f"DDP: the guess has nodes t, but the horizon is {horizon:g}; expected none: leave t out")
+        bad = np.flatnonzero(~((t[:, -1] >= horizon.low) & (t[:, -1] <= horizon.high)))
+        if bad.size:
+            raise ValueError(f"DDP: the guess's t ends at {t[bad[0], -1]:g} in row {bad[0]}; expected a horizon of "
+                             f"{horizon!r}")
 
     @cached_property
     def key(self) -> str:
         """A fingerprint of the problem, the model and the settings."""
         net = None if self.dynamics is None else self.dynamics.net
-        source = ddp_source(self.ocp, net, self.substeps, self.rows if self.held else None)
+        source = ddp_source(self.posed, net, self.substeps, self._multiplied)
         return fingerprint(self.ocp.to_data(), source, self._weights, self.intervals, self.settings, self.constraints,
                            *([self.between] if self.between else []), *([] if self.margin is None else [self.margin]),
                            version("nocl"))
@@ -263,25 +288,36 @@ class DDP:
         if given.shape not in ((), (1,), (B,)):
             raise ValueError(f"t0 has shape {given.shape}; expected a number, or one for each of the {B} states")
         times = np.broadcast_to(given, (B,)).copy()
+        if self.ocp.is_free:
+            return self._free_start_times(times)
         bad = np.flatnonzero(~((times >= 0) & (times < self.ocp.horizon)))
         if bad.size:
             raise ValueError(f"t0[{bad[0]}] is {times[bad[0]]}; expected 0 <= t0 < horizon = {self.ocp.horizon}")
         return times
 
 
+    def _free_start_times(self, times: Array) -> Array:
+        if times.any():
+            raise ValueError(f"t0 is {checks.shown(times)}, but the horizon is free; expected 0: the time that is left "
+                             "is found from there")
+        return times
+
+
 @lru_cache(maxsize=32)
 def substeps_for(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int, tolerance: float = COARSE) -> int:
     """As many as solutions from a few initial states ask for, so that they are off by `tolerance` at most."""
-    tried = ocp if ocp.states_only else ocp.unconstrained  # a few descents, to see how fast the plant is
+    free = ocp.is_free  # without its constraints a horizon would be as short as it may be
+    tried = ocp if ocp.states_only or free else ocp.unconstrained  # a few descents, to see how fast the plant is
     functions, (x0, p) = _functions(tried, dynamics), firsts(ocp)
 
     def ask(substeps: int) -> Grid | None:
-        ddp = DDP(tried, intervals=intervals, substeps=substeps, dynamics=dynamics, constraints="soft")
+        ddp = DDP(tried, intervals=intervals, substeps=substeps, dynamics=dynamics,
+                  constraints="hard" if free else "soft")
         ddp.checked = True
         return measured(tried, functions, ddp.solve(x0, p=p, progress=False), substeps)
 
-    return settled(f"DDP of {ocp.system.name}", ask, ocp.horizon / intervals, lambda: fastest_at_start(ocp, functions),
-                   tolerance)
+    step = (middle(ocp.horizon) if free else ocp.horizon) / intervals
+    return settled(f"DDP of {ocp.system.name}", ask, step, lambda: fastest_at_start(ocp, functions), tolerance)
 
 
 def _functions(ocp: OCP, dynamics: LearnedDynamics | None) -> Functions:

@@ -49,7 +49,7 @@ class DDPSettings(Checked):
 class Kernels(Protocol):
     """What a batch descends by; the DDP."""
 
-    ocp: OCP
+    posed: OCP  # what the kernel solves
     intervals: int
     substeps: int
     settings: DDPSettings
@@ -80,8 +80,8 @@ class Work:
 
     def __post_init__(self) -> None:
         self.begin = time.perf_counter()
-        self.rounding = ROUNDING * usual_sizes(self.ddp.ocp).cost
-        ocp, B, K = self.ddp.ocp, len(self.x0), self.ddp.intervals
+        self.rounding = ROUNDING * usual_sizes(self.ddp.posed).cost
+        ocp, B, K = self.ddp.posed, len(self.x0), self.ddp.intervals
         nx, nu = ocp.system.nx, ocp.system.nu
         self.p = np.zeros((B, 0)) if self.parameters is None else self.parameters
         self.h = (ocp.horizon - self.t0) / K
@@ -107,9 +107,13 @@ class Work:
     def rollout(self, rows: Rows, x_bar: Array, u_bar: Array, gain: Array) -> None:
         d = self.ddp
         d.evaluations["rollout"] += STAGES * d.substeps * d.intervals * len(rows)
-        d.kernel("nocl_rollout", rows, d.intervals, d._weights, d._lb, d._ub, self.h, *self.data, self.x0, x_bar, u_bar,
-                 self.k, gain, self.alpha, self.new_x, self.new_u, self.new_J, *self._held_in(), *self._held_out(),
-                 threads=d.threads)
+        d.kernel("nocl_rollout", rows, d.intervals, d._weights, d._lb, d._ub, self.h, *self.data, self._start(), x_bar,
+                 u_bar, self.k, gain, self.alpha, self.new_x, self.new_u, self.new_J, *self._held_in(),
+                 *self._held_out(), threads=d.threads)
+
+    def _start(self) -> Array:
+        """The states [B, nx] that rollouts begin at."""
+        return self.x0
 
     def backward(self, rows: Rows, V: Array | None = None, V_x: Array | None = None, V_xx: Array | None = None,
                  V_p: Array | None = None) -> None:
@@ -207,13 +211,13 @@ class Work:
         nx = self.x.shape[2]
         V, V_x = np.zeros((B, K + 1)), np.zeros((B, K + 1, nx))
         V_xx = np.zeros((B, K + 1, nx, nx)) if curvature else None
-        known = {"p": self.p, "V_p": np.zeros_like(self.p)} if self.ddp.ocp.np else {}
+        known = {"p": self.p, "V_p": np.zeros_like(self.p)} if self.ddp.posed.np else {}
         self._last_sweep(V, V_x, V_xx, known.get("V_p"))
         t = self.t0[:, None] + self.h[:, None] * np.arange(K + 1)
         message = self._messages(t)
         success = self.state == CONVERGED
         seconds = np.full(B, (time.perf_counter() - self.begin) / max(B, 1))
-        clearance = self.ddp.ocp.least(self.x, t, self.p).min(axis=1, initial=np.inf)
+        clearance = self.ddp.posed.least(self.x, t, self.p).min(axis=1, initial=np.inf)
         return Solution(t, self.x, self.u, self.gain, V, V_x, np.where(success, self._cost(), np.inf), success,
                         np.array(message, dtype=np.str_), seconds, self.iterations, V_xx, clearance=clearance,
                         **known)
@@ -231,7 +235,7 @@ class Work:
         return [self._words(int(state)) for state in self.state]
 
     def _words(self, state: int) -> str:
-        kinks = self.ddp.ocp.not_smooth if state in (OUT_OF_ITERATIONS, NO_DESCENT, NOT_CONVEX) else ""
+        kinks = self.ddp.posed.not_smooth if state in (OUT_OF_ITERATIONS, NO_DESCENT, NOT_CONVEX) else ""
         return MESSAGES[state] + (f"; {kinks}" if kinks else "")
 
 

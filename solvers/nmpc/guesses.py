@@ -11,7 +11,7 @@ from nocl.judge import answer_of, takes_p
 from nocl.ocp import OCP
 from nocl.solvers.lqr import LQR
 from nocl.solvers.nmpc.transcription import Transcription
-from nocl.solvers.starts import HALVINGS, near, random_controls
+from nocl.solvers.starts import HALVINGS, near, random_controls, spread_horizon
 from nocl.support import checks
 from nocl.support.checks import Array
 
@@ -42,17 +42,11 @@ def starts(program: Transcription, lqr: LQR | None, x0: Array, t: Array, begin: 
 def with_horizons(program: Transcription, x0: Array, t: Array, begin: int, n: int, seed: int,
                   p: Array | None = None) -> list[Guess]:
     """Those `starts` where the horizon is free, each with another one: evenly spread, of a logarithmic scale."""
-    horizon, found = program.ocp.horizon, list[Guess]()
+    found = list[Guess]()
     for number in range(begin, begin + n):
-        nodes = t / t[-1] * horizon.low ** (1 - _spread(number)) * horizon.high ** _spread(number)
+        nodes = t / t[-1] * spread_horizon(program.ocp.horizon, number)
         found += [(*guess, nodes) for guess in starts(program, None, x0, nodes, number, 1, seed, p)]
     return found
-
-
-def _spread(number: int) -> float:
-    """1/2, 1/4, 3/4, 1/8, 5/8, ...: the numbers from 1 on, their binary digits behind the point in reverse."""
-    digits = bin(number + 1)[2:]
-    return sum(2.0 ** -(i + 1) for i, digit in enumerate(reversed(digits)) if digit == "1")
 
 
 def lqr_of(ocp: OCP) -> LQR | None:

@@ -29,6 +29,7 @@ from nocl.solvers.nmpc.sensitivity import cost_to_go, dense, second_variation
 from nocl.solvers.nmpc.tasks import Outcome, Task, attempt, failure, outside, solved_by, violated_start
 from nocl.solvers.nmpc.transcription import BACKENDS, Answer, Transcription
 from nocl.solvers.search import Found, Moves, Rows, Search
+from nocl.solvers.starts import middle
 from nocl.substeps import Grid, settled
 from nocl.support import checks, compiler
 from nocl.support.checks import Array
@@ -334,8 +335,7 @@ class NMPC:
         if t0 != 0 or nodes is not None:
             raise ValueError(f"NMPC: t0 is {t0!r}, nodes are {checks.shown(nodes)}, but the horizon is free; expected "
                              "t0 = 0 and no nodes: the solver finds where they are")
-        horizon = self.ocp.horizon
-        return np.linspace(0.0, np.sqrt(horizon.low * horizon.high), self.intervals + 1)
+        return np.linspace(0.0, middle(self.ocp.horizon), self.intervals + 1)
 
     def _run_key(self, x0: Array, t: Array, p: Array, given: list[list[Guess]], *counts: int) -> str:
         """A fingerprint of all that outcomes depend on."""
@@ -451,7 +451,6 @@ class _States:
         self.x0, self.t, self.p = call.x0, call.t, call.p
         self.refusal = [violated_start(nmpc.program, x, self.t[0], p) for x, p in zip(self.x0, self.p, strict=True)]
         self.failed: list[Answer | None] = [None] * len(self.x0)  # of each state's solves that failed, by rank
-        self.cost, self.horizon = np.full(len(self.x0), np.inf), np.full(len(self.x0), self.t[-1])  # of the best so far
 
     def begin(self, stage: int, what: str) -> None:
         self.number, self.what = stage - 1, what
@@ -474,9 +473,8 @@ class _States:
             mine = moves[moves.row == i]
             made = guess(mine)
             guesses = [starting.from_neighbour(self.x0[i], x, u) for x, u in zip(made["x"], made["u"], strict=True)]
-            if self.nmpc.ocp.is_free:
-                shares = self.horizon[mine.parent] / self.t[-1] * (1 - mine.begin / self.t[-1])
-                guesses = [(*one, share * self.t) for one, share in zip(guesses, shares, strict=True)]
+            if "t" in made:
+                guesses = [(*one, t) for one, t in zip(guesses, made["t"], strict=True)]
             tasks.append(Task(f"round-{self.number}-{i:06d}", int(i), self.x0[i], self.t, guesses,
                               time_limit=self.nmpc.time_limit, p=self._own(i)))
         return self._do(tasks)
@@ -486,8 +484,6 @@ class _States:
         outcomes = do(_Job(self.nmpc), tasks, self.call.pool, self.journal, self.call.show, self.what)
         for outcome in outcomes:
             best, failed = self.failed[outcome.row], outcome.failed
-            if outcome.best is not None and outcome.best.t is not None and outcome.best.cost < self.cost[outcome.row]:
-                self.cost[outcome.row], self.horizon[outcome.row] = outcome.best.cost, outcome.best.t[-1]
             if failed is not None and (best is None or failed.rank < best.rank):
                 self.failed[outcome.row] = failed
         yield np.array([o.row for o in outcomes], dtype=np.int64), \
