@@ -139,7 +139,7 @@ def test_a_policy_holds_constraints_of_u_in_casadi_and_in_files(tmp_path):
 
 
 def test_what_is_exported_is_the_same(tmp_path):
-    certificate = wild_policy(double_integrator()).export(tmp_path, to=("casadi", "c"))
+    certificate = wild_policy(double_integrator()).export(tmp_path, to=("casadi", "c", "onnx"))
     assert certificate.ok
 
 
