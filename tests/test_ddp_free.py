@@ -147,7 +147,7 @@ def test_without_constraints_the_end_costs():
     s = solver(ocp).solve([[1.0, 0.2], [-0.5, 0.5]])
     assert s.success.all()
     assert np.abs(s.x[:, -1]).max() > 1e-3
-    assert_nmpcs(ocp, s, cost=3e-6)  # with most controls at their bounds IPOPT's barrier costs as much:
+    assert_nmpcs(ocp, s, cost=3e-6, costates=1e-4)  # with most controls at their bounds IPOPT's barrier costs as much:
     other = NMPC(ocp, 20, substeps=1, solver="ipopt", passes=0).solve(s.x[:, 0], s, workers=1)
     assert (s.cost < other.cost * (1 + 1e-9)).all()
 

@@ -21,6 +21,7 @@ DOOR = {  # files that may hold the symbols of a system and the expressions of a
     "nocl/ocp.py",  # where L, G and h are
     "nocl/functions.py",  # the door
     "solvers/cnd/lifted.py",  # where a problem is written anew, p and t among its states
+    "solvers/ddp/free.py",  # and where its horizon is one of them
 }
 SYSTEM = {"x", "u", "p", "xdot"}  # what only they read of a System ...
 OCP = {"running", "terminal"}  # ... and of an OCP

@@ -290,7 +290,7 @@ def test_a_user_may_draw(mine):
 
 
 def test_what_cannot_be_animated_is_told(mine):
-    failed = int(np.flatnonzero(~mine.judged[1].simulation.success)[0])
+    failed = int(np.flatnonzero(~mine.judged[1].simulation.reached)[0])
     for options, text in (({"state": 99}, "expected one of the 10"), ({"methods": ["?"]}, "there is no method '\\?'"),
                           ({"state": failed}, "a method failed from state")):
         with pytest.raises(ValueError, match=text):

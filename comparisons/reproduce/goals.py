@@ -98,8 +98,9 @@ def _dubins() -> OCP:
 
 def _sights(ocp: OCP) -> ca.SX:
     """Features of the car: where goal and obstacle are, seen from the car, and car and obstacle, seen from the goal."""
-    x, heading, centre, radius = ocp.system.x[:2], ocp.system.x[2], ocp.p[:2], ocp.p[2]
-    goal, direction = ocp.p[3:5], ocp.p[5]
+    at = ocp.functions.arguments
+    x, heading, centre, radius = at["x"][:2], at["x"][2], at["p"][:2], at["p"][2]
+    goal, direction = at["p"][3:5], at["p"][5]
     to_goal, to_obstacle = goal - x, centre - x
     away, left = (ca.sqrt(ca.sumsqr(way) + 1e-4) for way in (to_obstacle, to_goal))
     ahead, straight = _turned(to_obstacle, heading), to_goal / left
