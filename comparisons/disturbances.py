@@ -162,7 +162,8 @@ class _Study:
         cost = np.full(len(self.x0), np.inf)
         ok = np.flatnonzero(found.success)
         if ok.size:
-            cost[ok] = simulate(other, found.u[ok], self.x0[ok], p=None if self.p is None else self.p[ok]).cost
+            run = simulate(other, found.u[ok], self.x0[ok], p=None if self.p is None else self.p[ok])
+            cost[ok] = np.where(run.success, run.cost, np.inf)
         return cost
 
     def real_time(self, calm: Sequence[Judgement], best: Array) -> Scenario:
@@ -197,17 +198,19 @@ class _Study:
 
     def scenario(self, name: str, text: str, runs: Sequence[MethodRun], judgements: Sequence[Judgement], best: Array,
                  delays: Sequence[float] | None = None) -> Scenario:
-        losses = []
+        losses, counted = [], self.counted(best, judgements)
         for run, j, d in zip(runs, judgements, delays or [0.0] * len(runs), strict=True):
             said = run.how if run.solved is not None else how(run.hold, d)
             ok = np.asarray(j.simulation.success, dtype=bool)
             cost = np.where(ok, j.simulation.cost, np.inf)
-            losses.append(ScenarioLoss(run.name, said, cost, best, ok, j.ms_per_control, self.counted(best)))
+            losses.append(ScenarioLoss(run.name, said, cost, best, ok, j.ms_per_control, counted))
         return Scenario(name, text, tuple(losses))
 
-    def counted(self, best: Array) -> Array:
-        """[B], the states that count: on a problem with constraints those from which a plan still holds them."""
-        return np.isfinite(best) if self.ocp.constraint_names else np.ones(len(best), dtype=bool)
+    def counted(self, best: Array, judgements: Sequence[Judgement]) -> Array:
+        """[B], the states that count: on a problem with constraints those from which a plan, or a run, holds them."""
+        if not self.ocp.constraint_names:
+            return np.ones(len(best), dtype=bool)
+        return np.any([np.isfinite(best), *(j.simulation.success for j in judgements)], axis=0)
 
 
 def _text(sigma: float | Sequence[float]) -> str:

@@ -28,6 +28,7 @@ KINKS = ("solvers that use second derivatives may fail there; smooth it, nocl.sm
          "nocl.smooth_max(a, b, width), or split a control, nocl.split_controls(system, names)")
 PLACES = 256  # initial states that constraints are measured at
 SAMPLES = 64  # initial states, and parameters, that a problem is tried at on construction
+ROUNDING = 1e-6  # of a scale: no violation
 FEW = 5  # parameters, beside the usual ones, that constraints are tried at
 N_IMAGES, SAME_IMAGE = 16, 1e-9  # points of the box; relative to usual values, images that agree so far are one
 
@@ -286,8 +287,9 @@ class OCP:
         return any(ca.depends_on(c, self._all_p) for _, c in one.sides())
 
     def _several_parameters(self) -> Array:
-        """[n, np], the nominal ones, the least, the largest, and a few of their distribution."""
-        return np.vstack([self.nominal, *self.parameter_box, self.sample_parameters(FEW)])
+        """[n, np], the nominal ones, of a box the least and the largest, and a few of their distribution."""
+        ends = self.parameter_box if isinstance(self.parameters, Uniform) else ()
+        return np.vstack([self.nominal, *ends, self.sample_parameters(FEW)])
 
     def _warn_of_goal(self, owner: str) -> None:
         """Of constraints that the goal itself does not hold at some parameters."""
@@ -295,6 +297,7 @@ class OCP:
         moments = {"t": np.full(len(p), self.longest), "p": p}
         rows = self.functions.rows[:self.functions.rows.n_h]
         h = self.h(*self.functions.node.columns(x=self.goals(p)[0], **moments)).full()
+        h = np.where(h < -ROUNDING * self.constraint_scales[:, None], h, 0.0)
         for i in map(int, np.flatnonzero((h < 0).any(axis=1))):
             worst = int(h[i].argmin())
             warnings.warn(f"{owner}: the goal itself does not hold {rows.of[i].title} at {(h[i] < 0).sum()} of "
@@ -826,6 +829,8 @@ def _flat(x: Array, t: Any, p: Array | None) -> dict[str, Any]:
 
 def _least(c: Array, B: int, nodes: int) -> Array:
     """Rows [m, B * nodes] as their least values [B, m]; inf for NaN."""
+    if not B:
+        return np.full((0, len(c)), np.inf)
     c = c.reshape(len(c), B, nodes)
     return np.where(np.isfinite(c), c, np.inf).min(axis=2, initial=np.inf).T
 

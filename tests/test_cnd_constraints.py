@@ -102,6 +102,20 @@ def test_which_rows_the_output_map_holds():
     assert names == ["ball", "line"]
 
 
+@pytest.mark.filterwarnings("ignore:.*kink")
+def test_a_row_with_a_kink_is_not_taken_for_affine():
+    """The derivatives of |u| at 0 say that it is constant; the map would let everything through."""
+    u = ca.SX.sym("u", 2)
+    x = ca.SX.sym("x", 2)
+    system = nocl.System("slide", x=x, u=u, xdot=u, lbu=[-1, -1], ubu=[1, 1], lbx=[-2, -2], ubx=[2, 2])
+    ocp = OCP(system, horizon=1.0, running=ca.sumsqr(u), terminal=ca.sumsqr(x), x_goal=[0, 0], u_goal=[0, 0],
+              initial_states=nocl.Uniform([-1, -1], [1, 1]),
+              constraints={"diamond": 1 - ca.fabs(u[0]) - ca.fabs(u[1]), "sum": 1 - u[0] - u[1],
+                           "least": ca.fmin(1 - u[0], 0.9 - u[1])})
+    assert dict(zip(ocp.functions.rows.names, projected(ocp), strict=True)) == {
+        "diamond": False, "sum": True, "least": False}
+
+
 def test_a_set_without_room_is_refused():
     ocp = double_integrator(constraints={})
     a, b = ca.vertsplit(ocp.system.u)
@@ -159,6 +173,17 @@ def test_a_solver_keeps_its_margins():
     slow = held.solver(elastic, margin)
     slow.kernel = NumpyKernel(ocp, None, 1, slow.rows)
     np.testing.assert_allclose(slow.solve(x0).cost, s.cost, rtol=1e-8)
+
+
+def test_a_solver_with_margins_is_another_solver():
+    ddp = DDP(double_integrator(), intervals=10, substeps=1, threads=1)
+    n, known = len(ddp.rows.stage) + len(ddp.rows.end), ddp.key
+    inside = ddp.inside(np.full(n, 0.01))
+    assert inside.key != known == ddp.key
+    for wrong in (np.zeros(n + 1), np.full(n, np.nan)):
+        with pytest.raises(ValueError, match="margin"):
+            ddp.inside(wrong)
+    assert len(ddp.solve(np.zeros((0, 2)))) == 0
 
 
 def test_a_state_between_margin_and_boundary_has_a_label():

@@ -304,8 +304,9 @@ def notes(report: Results) -> list[str]:
     if known < n:
         said.append(f"From {n - known} of {count(n, 'state')} no such baseline reaches the horizon and holds all "
                     "constraints: there the gap to the best known cost alone is given.")
-    if beaten := known - int((c & report.gainful & np.isfinite(report.base)).sum()):
-        said.append(f"On {beaten} of {count(n, 'state')} nothing is missed: no method costs less than such a baseline.")
+    if beaten := int((c & (report.base <= report.best)).sum()):
+        said.append(f"On {beaten} of {count(n, 'state')} no method costs less than such a baseline: what is best known "
+                    "there is a method's, and may be far from the optimum.")
     return [*NOTE, *said]
 
 

@@ -268,7 +268,8 @@ def judged(problem: str, cnd: Any, n: int, seed: int) -> tuple[Array, int]:
     x0, p = drawn(ocp, n, seed)
     own, reference = with_reference(compare(ocp, {"CND": cnd}, x0=x0, p=p, progress=False), FINE).judged
     best = np.minimum(optima(problem, n, seed), _held(reference))
-    gap = np.where(own.simulation.success, (own.simulation.cost - best) / np.abs(best), np.inf)
+    known = own.simulation.success & np.isfinite(best)
+    gap = np.divide(own.simulation.cost - best, np.abs(best), out=np.full(len(best), np.inf), where=known)
     return gap, int((own.simulation.violation > 0).sum())
 
 

@@ -65,9 +65,10 @@ class Held:
         return ddp.inside(np.r_[margin[:m], margin[:of_x], margin[m:]])
 
     def labels(self, solution: Solution) -> Solution:
-        """The same, without success where a plan leaves what is held after its start by more than LOST."""
-        s, later = solution, slice(1, None)
-        least = self.ocp.least_held(s.x[:, later], s.u[:, later], s.t[:, later], s.parameters)
+        """The same, without success where a plan leaves by more than LOST what x0 alone does not decide."""
+        s, later, n = solution, slice(1, None), self.ocp.functions.rows.n_x
+        least = self.ocp.least_held(s.x, s.u, s.t, s.parameters)
+        least[:, :n] = self.ocp.least_held(s.x[:, later], s.u[:, later], s.t[:, later], s.parameters)[:, :n]
         over = self.ocp.violation(least, self.ocp.least_at_end(s.x[:, -1], s.parameters))
         return replace(s, success=s.success & (over <= LOST))
 
@@ -77,9 +78,9 @@ class Held:
         """
         _, x, t = continuous_run(policy, torch_ocp, at, steps)
         B, nodes = t.shape
-        here, flat = torch_ocp.at(np.repeat(at.p, nodes, axis=0)), torch.from_numpy(x.reshape(B * nodes, -1))
+        here, flat = torch_ocp.at(np.repeat(at.p, nodes, axis=0)), torch.from_numpy(x.reshape(B * nodes, x.shape[2]))
         with torch.no_grad():
-            u = policy(flat, torch.from_numpy(t.reshape(-1, 1)), *here.p).numpy().reshape(B, nodes, -1)
+            u = policy(flat, torch.from_numpy(t.reshape(-1, 1)), *here.p).numpy().reshape(B, nodes, self.ocp.system.nu)
         least = np.hstack([self.ocp.least_held(x, u, t, at.p), self.ocp.least_at_end(x[:, -1], at.p)])
         lost = ~np.isfinite(x[:, -1]).all(axis=1)
         return np.where(lost[:, None], np.inf, -least / self.scales)

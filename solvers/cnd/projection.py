@@ -20,6 +20,7 @@ from nocl.support.checks import Array
 
 CURVED = 1e-9  # of the largest entry: a Hessian's eigenvalue above that is not concave
 DEEP = 0.2  # of the deepest point's distance to what is held: u* is the centre where it is as deep
+TRIED = 256  # controls at which a row is held against its quadratic model
 TINY = 1e-30  # under the root, whose slope at 0 is inf
 QUIET: dict[str, Any] = {"print_time": False, "ipopt.print_level": 0, "ipopt.sb": "yes", "ipopt.tol": 1e-8}
 
@@ -32,7 +33,7 @@ def projected(ocp: OCP) -> NDArray[np.bool_]:
     found = np.zeros(len(rows), dtype=bool)
     for i in np.flatnonzero(rows.of_u & ~rows.equal):
         c = rows.column[int(i)]
-        found[i] = not ca.depends_on(c, others) and _concave(c, at["u"])
+        found[i] = not ca.depends_on(c, others) and _concave(c, at["u"]) and _smooth(ocp, c)
     return found
 
 
@@ -43,6 +44,18 @@ def _concave(c: ca.SX, u: ca.SX) -> bool:
         return False
     values = np.linalg.eigvalsh(ca.DM(ca.densify(ca.evalf(H))).full())
     return bool(values.max() <= CURVED * max(np.abs(values).max(), 1e-300))
+
+
+def _smooth(ocp: OCP, c: ca.SX) -> bool:
+    """Whether c is what its value and derivatives at the middle of U say everywhere in U: |u| has none that do."""
+    s, u, d = ocp.system, ocp.functions.arguments["u"], ca.SX.sym("d", ocp.system.nu)
+    middle = ca.DM((s.lbu + s.ubu) / 2)
+    H, g = ca.hessian(c, u)
+    model = c + ca.dot(g, d) + ca.bilin(H, d, d) / 2
+    both = ca.Function("both", [d], [ca.substitute(model, u, middle), ca.substitute(c, u, middle + d)])
+    away = np.random.default_rng(0).uniform(-1, 1, (TRIED, s.nu)) * (s.ubu - s.lbu) / 2
+    said, true = (value.full() for value in both(away.T))
+    return bool(np.allclose(said, true, rtol=1e-9, atol=1e-9 * np.abs(true).max()))
 
 
 def retracted(ocp: OCP, v: ca.SX) -> ca.SX:

@@ -185,7 +185,7 @@ class Training:
             self._validate()
             self.round += 1
             self._save()
-        if (remark := advice(self.history[-1], self.round - 1, s.held_out)) is not None:
+        if (remark := advice(self.history[-1], self.round - 1, s.held_out, s.violating)) is not None:
             warnings.warn(f"{self.ocp.system.name}: {remark}", stacklevel=4)
         value = self._value() if s.value else None
         cnd = CND(self.ocp, self.net, value, self._card())
@@ -255,7 +255,7 @@ class Training:
                 parts.append(self._labels(again, rng))
                 bar.update()
             self.labels = Labels.join(parts)
-            self.bank = SolutionBank.of(self.ddp, self.solved[0])
+            self.bank = replace(SolutionBank.of(self.ddp, self.solved[0]), several=self.bank.several)
 
     def _visit(self) -> None:
         s, rng = self.settings, self._rng(self.round)
@@ -396,6 +396,7 @@ class Training:
         last, own = self.history[-1], {} if self.own is None else {"features": self.own.numel_out(0)}
         return {"method": "default", "dynamics": "learned" if self.learned else "exact", "seed": self.seed,
                 **{name: last[name] for name in ("gap_median", "gap_p95", "kicked_median", "kicked_p95", "unsolved")},
+                **{name: last[name] for name in ("gap_violating", "kicked_violating", "infeasible") if name in last},
                 "seconds": round(self.seconds, 1),
                 "fitting_seconds": round(self.fitting, 1),  # of these, fits of networks; the others solve problems
                 "fitting_cpu_seconds": round(self.fitting_cpu, 1),

@@ -139,11 +139,16 @@ def _hjb(value: FeatureNet, policy: Policy, torch_ocp: InTorch, tails: Solution)
     return {"hjb_median": float(np.median(residual)) / usual, "hjb_mean": float(residual.mean()) / usual}
 
 
-def advice(row: dict[str, Any], rounds: int, held_out: int) -> str | None:
+def advice(row: dict[str, Any], rounds: int, held_out: int, violating: float = 1.0) -> str | None:
     """What to say, and to try, where the last round's gap is large or few states tell it; None where it is well."""
     if row["unsolved"] > 0.1 * held_out:
         return (f"{row['unsolved']} of {held_out} held-out initial states could not be solved, the gap is that of the "
                 "others: try TrainSettings with more seeds and starts, or more intervals where the dynamics are fast")
+    if row.get("gap_violating", 0.0) > violating:
+        name, worst = max(row["gap_worst"].items(), key=lambda item: item[1])
+        return (f"{100 * row['gap_violating']:.2g} % of runs from held-out initial states violate a constraint after "
+                f"{rounds} rounds, {name!r} by {worst:.2g} of its scale at worst; expected {100 * violating:g} %: "
+                "try TrainSettings with more rounds, visits or states, or wider layers (hidden=(128, 128, 128))")
     if row["gap_median"] <= 0.01 and row["gap_p95"] <= 0.2:
         return None
     tries = ("more rounds or visits, wider layers (hidden=(128, 128, 128)) or more iterations"

@@ -17,15 +17,16 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from nocl.constraints import TOLERANCE
 from nocl.scales import usual_sizes
 from nocl.solvers.ddp.batch import Rows
-from nocl.solvers.ddp.work import BLEW_UP, CONVERGED, NO_DESCENT, NOT_CONVEX, NOT_HELD, OUTSIDE, RUNNING, Work
+from nocl.solvers.ddp.work import BLEW_UP, CONVERGED, NOT_CONVEX, NOT_HELD, OUTSIDE, RUNNING, Work
 from nocl.support.checks import Array
 
 HELD = 1e-9  # of a scale: the largest violation at a node
 MULTIPLIER = 1e-7  # of the cost for a scale: what multipliers may be off by
 TOLD = 1e-6  # of a scale: what is less is not worth a message
-TOLERATED = 0.01  # of a scale: violated by so much by the initial state itself, a problem has no answer
+TOLERATED = TOLERANCE  # of a scale: violated by more by the initial state itself, a problem has no answer
 ROUNDING = 1e-13  # of the usual cost
 SLACK = 0.1  # of sum rho e^2 / 2, what a round may leave of the merit: 1 is too much
 ENOUGH = 0.25  # of the last round's violation: if more is left, rho grows
@@ -105,6 +106,7 @@ class Augmented(Work):
         for name, value in kept.items():
             getattr(self, name)[back] = value[back]
         margin[back] = 0.0 if before is None else before[back]
+        self.cut[rows] = False
         self.cut[back] = True
 
     def _held_in(self) -> list[Array | None]:
@@ -181,7 +183,7 @@ class Augmented(Work):
         told = (over.max(axis=1, initial=0.0) > TOLD) & (self.state != OUTSIDE) & (self.state != BLEW_UP)
         for i in np.flatnonzero(told):
             name, where = self._worst(over[i])
-            if self.state[i] in (NOT_HELD, NO_DESCENT):
+            if self.state[i] == NOT_HELD:
                 message[i] = f"infeasible: no plan holds {name!r} from here{words(self.p[i])}, {where}"
             else:
                 message[i] += f"; {name!r} is left, {where}"

@@ -137,37 +137,47 @@ class FreeTime(Augmented):
     def _next_round(self, rows: Rows, grows: NDArray[np.bool_]) -> None:
         """What does not come nearer to its constraints has too little time: first it gets more."""
         short = (self.parts[rows, 2] > 0.5 * self.last[rows]) & (self.parts[rows, 2] > FAR) & (self.T[rows] < self.high)
-        self._lengthen(rows[short])
-        super()._next_round(rows[~short], grows[~short])
+        blown = self._lengthen(rows[short])
+        left = ~short | np.isin(rows, blown)
+        super()._next_round(rows[left], grows[left])
 
-    def _lengthen(self, rows: Rows) -> None:
-        """The same controls in a longer time, from which the descent begins anew."""
+    def _lengthen(self, rows: Rows) -> Rows:
+        """The same controls in a longer time, from which the descent begins anew; those that blow up, as they were."""
         if not rows.size:
-            return
+            return rows
+        before = {name: getattr(self, name)[rows] for name in ("k", "gain", "y", "penalty")}
         self.k[rows], self.gain[rows], self.y[rows] = 0.0, 0.0, 0.0
         self.penalty[rows, 0] = np.minimum(DEARER * self.penalty[rows, 0], LARGEST * self.unit)
         self.dT[rows], self.alpha[rows] = SLOWER * self.T[rows], 1.0
         self.rollout(rows, self.x, self.u, self.gain)
-        self._take(rows)
-        self.mu[rows], self.last[rows], self.stalls[rows] = 0.0, np.inf, 0
+        good = np.isfinite(self.new_J[rows])
+        for name, value in before.items():
+            getattr(self, name)[rows[~good]] = value[~good]
+        longer = rows[good]
+        self._take(longer)
+        self.mu[longer], self.last[longer], self.stalls[longer] = 0.0, np.inf, 0
+        return rows[~good]
 
     def solution(self, curvature: bool) -> Solution:
-        return unlifted(super().solution(True), self._found(), curvature)
+        return unlifted(super().solution(True), self._found(), curvature, self.ddp.posed.uses_time)
 
     def _found(self) -> NDArray[np.bool_]:
         """Where T lies between its bounds."""
         return np.asarray((self.low < self.T) & (self.high > self.T))
 
 
-def unlifted(s: Solution, found: NDArray[np.bool_], curvature: bool) -> Solution:
+def unlifted(s: Solution, found: NDArray[np.bool_], curvature: bool, timed: bool) -> Solution:
     """A lifted problem's solution as one of the problem itself: each row has the nodes t of its own T.
 
     gain and V_xx are those where the horizon is found anew from each node on, if `found` [B] says that T is no bound:
-    for what is left of the plan T - V_Tx (x - x_k) / V_TT is best.
+    for what is left of the plan T - V_Tx (x - x_k) / V_TT is best. Of a problem that holds the time (`timed`) that is
+    so at the first node alone, since another T moves the time of the others: there they are those of a fixed T.
     """
     assert s.V_xx is not None
     bent = s.V_xx[..., -1, -1]
     firm = found[:, None] & (bent > FLAT * np.abs(bent).max(axis=1, keepdims=True))
+    if timed:
+        firm[:, 1:] = False
     moves = np.where(firm[..., None], -s.V_xx[..., -1, :-1] / np.where(firm, bent, 1.0)[..., None], 0.0)  # dT/dx
     gain = s.gain[..., :-1] + s.gain[..., -1:] * moves[:, :-1, None, :]
     V_xx = s.V_xx[..., :-1, :-1] + s.V_xx[..., :-1, -1:] * moves[..., None, :]

@@ -131,8 +131,9 @@ class DDP:
     def inside(self, margin: Array) -> DDP:
         """The same solver, which holds each row further inside, by a share of its scale [rows of a stage, then of the
         end]."""
-        other = self._with_threads(self.threads)
-        other.margin = np.asarray(margin, dtype=np.float64)
+        n, other = len(self.rows.stage) + len(self.rows.end), self._with_threads(self.threads)
+        other.margin = checks.vector(margin, n, "margin", "DDP.inside")
+        other.__dict__.pop("key", None)  # it is another solver
         return other
 
     def solve(self, x0: ArrayLike, t0: ArrayLike = 0.0, *, u: Array | None = None, x: Array | None = None,
