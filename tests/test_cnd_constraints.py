@@ -9,10 +9,11 @@ import torch
 from constrained import point
 
 import nocl
+from nocl.constraints import TOLERANCE
 from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.cnd import CND, TrainSettings
-from nocl.solvers.cnd.held import ALLOWED, FIRST, LARGEST, LOST, Held
+from nocl.solvers.cnd.held import FIRST, LARGEST, LOST, Held
 from nocl.solvers.cnd.in_torch import InTorch
 from nocl.solvers.cnd.labels import Labels, Problems
 from nocl.solvers.cnd.projection import projected, retracted
@@ -202,7 +203,7 @@ def test_margins_make_up_for_what_is_exceeded_and_no_more():
     exceeded = np.full((100, len(names)), -0.3)
     exceeded[:, names == "speed"] = 4e-3
     later = held.next(held.first, exceeded)
-    np.testing.assert_allclose(later[names == "speed"], FIRST + 4e-3 - ALLOWED / 2)
+    np.testing.assert_allclose(later[names == "speed"], FIRST + 4e-3 - TOLERANCE / 2)
     assert (later[names == "thrust"] == 0).all()  # the output map holds it
     exceeded[:] = -0.3
     assert (held.next(later, exceeded) == 0).all()
@@ -225,7 +226,7 @@ def test_what_a_policy_exceeds_is_what_the_judge_says():
     judged = nocl.simulate(ocp, cnd, x0, nodes=41).violation
     np.testing.assert_allclose(np.maximum(over.max(axis=1), 0), judged, atol=2e-4)
     shares = held.summary(over, "gap")
-    assert shares["gap_violating"] == np.mean(judged > ALLOWED)
+    assert shares["gap_violating"] == np.mean(judged > TOLERANCE)
     assert shares["gap_worst"]["speed"] == pytest.approx(judged.max(), abs=2e-4)
 
 

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from nocl.constraints import TOLERANCE
 from nocl.data import Solution
 from nocl.ocp import OCP
 from nocl.solvers.cnd.in_torch import InTorch
@@ -28,7 +29,6 @@ from nocl.support.checks import Array
 FIRST = 1e-3  # of a scale, the first margin of each row
 LARGEST = 0.05  # of a scale, the largest
 SELDOM = 0.02  # of held-out runs may exceed what a margin makes up for
-ALLOWED = 1e-3  # of a scale: what is less counts as no violation
 LOST = 0.01  # of a scale: a plan that leaves more is no label
 
 
@@ -89,7 +89,7 @@ class Held:
         """The margins for labels of the next round."""
         if not len(exceeded):
             return margin
-        more = np.quantile(exceeded, 1 - SELDOM, axis=0, method="higher") - ALLOWED / 2
+        more = np.quantile(exceeded, 1 - SELDOM, axis=0, method="higher") - TOLERANCE / 2
         return np.where(self.inward, np.clip(margin + more, 0.0, LARGEST), 0.0)
 
     def summary(self, exceeded: Array, name: str) -> dict[str, Any]:
@@ -98,5 +98,5 @@ class Held:
         each: dict[str, float] = {}
         for row, title in enumerate(self.names):
             each[title] = max(each.get(title, 0.0), float(worst[:, row].max(initial=0.0)))
-        share = float((worst.max(axis=1, initial=0.0) > ALLOWED).mean()) if len(worst) else float("nan")
+        share = float((worst.max(axis=1, initial=0.0) > TOLERANCE).mean()) if len(worst) else float("nan")
         return {f"{name}_violating": share, f"{name}_worst": each}

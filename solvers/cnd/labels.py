@@ -23,7 +23,7 @@ from nocl.translate.rk4 import rk4
 Policy = Callable[..., Tensor]  # (x, t[, p]) -> u
 NEIGHBOURS = 10  # starts of a tail of a problem with parameters: the nearest one's optimum may be of another kind
 PROBED, RARE, SAME = 300, 0.003, 1e-4  # states by which it is found out whether there are such; costs so close are one
-KEPT = 2  # of them: those cheapest after one iteration; as good as all of six, in a quarter of the time
+KEPT = 2  # of them are followed to the end: those cheapest after one iteration
 NEAR = 0.1  # how near hard problems more are drawn
 SMALL = 0.1  # of a usual cost: what is added to costs before anything is divided by them
 COARSE = (2, 5, 10, 20, 40, 160, 640)  # intervals of tails that are solved for other control rates than the labels'
