@@ -7,22 +7,25 @@ import warnings
 import casadi as ca
 import numpy as np
 
-from nocl.comparisons.methods import Starts
-from nocl.judge import simulate
+from nocl.comparisons.judging import Disturbance, Judging, judge
+from nocl.comparisons.methods import Solving, Starts, runs_of
 from nocl.ocp import OCP
 from nocl.solvers.lqr import LQR
 from nocl.support.checks import Array
 
 
-def base_cost(ocp: OCP, starts: Starts, tolerance: float) -> Array:
+def base_cost(ocp: OCP, starts: Starts, tolerance: float, solving: Solving) -> Array:
     """[B], the least cost of simple baselines that reach the horizon with all constraints held; NaN where none does.
 
     They are a control that is held throughout, at u*, at the middle of U and at 0, and LQR, clipped to U, where the
     goal has one.
     """
-    p = starts.p if ocp.np else None
-    runs = [simulate(ocp, law, starts.x, p=p, tolerance=tolerance) for law in _laws(ocp)]
-    least = np.min([np.where(run.success, run.cost, np.inf) for run in runs], axis=0)
+    laws = {f"baseline {number}": law for number, law in enumerate(_laws(ocp), 1)}
+    runs = runs_of(ocp, laws, starts, (None,), solving)
+    job = Judging(ocp, starts, runs, Disturbance(), [0.0] * len(runs), timed=False, tolerance=tolerance)
+    folder = None if solving.out is None else solving.out / "baselines"
+    judged = [of.simulation for of in judge(job, solving.workers, folder, solving.progress, "simple baselines")]
+    least = np.min([np.where(run.success, run.cost, np.inf) for run in judged], axis=0)
     return np.where(np.isfinite(least), least, np.nan)
 
 

@@ -67,10 +67,11 @@ def compare(ocp: OCP, methods: Mapping[str, Any], n: int = 100, x0: ArrayLike | 
     states = starts_of(ocp, n, x0, seed, p)
     rates, folder = rates_of(hold), None if out is None else Path(out)
     most, start = checks.number(tolerance, "tolerance", "compare"), time.perf_counter()
-    judged = judged_runs(ocp, methods, states, rates, Solving(workers, folder, progress), most)
+    solving = Solving(workers, folder, progress)
+    judged = judged_runs(ocp, methods, states, rates, solving, most)
     solved = np.any([j.feasible for j in judged], axis=0)
-    why = impossible(ocp, states, solved, [j.simulation.u[:, :-1] for j in judged], most)
-    base = base_cost(ocp, states, most)
+    why = impossible(ocp, states, solved, [j.simulation.u[:, :-1] for j in judged], most, solving)
+    base = base_cost(ocp, states, most, solving)
     drawn = f"drawn with seed {seed}"
     settings: dict[str, Any] = {"seed": seed if x0 is None and p is None else None, "n": len(states),
                                 "hold": ", ".join("continuous" if rate is None else str(rate) for rate in rates),

@@ -7,11 +7,12 @@ from cold starts and from what the methods did. It is the word of a local solver
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from nocl.comparisons.methods import Starts
+from nocl.comparisons.methods import Solving, Starts
 from nocl.data import Solution
 from nocl.ocp import OCP
 from nocl.solvers.ddp.global_search import solve_globally
@@ -23,7 +24,7 @@ STARTS = 8  # cold ones
 
 
 def impossible(ocp: OCP, starts: Starts, solved: NDArray[np.bool_], controls: Sequence[Array],
-               tolerance: float) -> tuple[str, ...]:
+               tolerance: float, solving: Solving) -> tuple[str, ...]:
     """[B], why no plan holds the constraints from a state, "" where one does or nothing is known.
 
     solved [B]: where a method held them; controls: those of the methods' runs [B, K, nu], NaN where there are none;
@@ -36,7 +37,8 @@ def impossible(ocp: OCP, starts: Starts, solved: NDArray[np.bool_], controls: Se
         message[i] = why
     left = np.array([i for i in open_rows if not message[i]], dtype=np.int64)
     if left.size:
-        for i, why in zip(left, _asked(ocp, starts[left], [u[left] for u in controls], tolerance), strict=True):
+        said = _asked(ocp, starts[left], [u[left] for u in controls], tolerance, solving)
+        for i, why in zip(left, said, strict=True):
             message[i] = why
     return tuple(message)
 
@@ -53,15 +55,20 @@ def _outside(ocp: OCP, starts: Starts, tolerance: float) -> list[str]:
     return said
 
 
-def _asked(ocp: OCP, starts: Starts, controls: Sequence[Array], tolerance: float) -> list[str]:
+def _asked(ocp: OCP, starts: Starts, controls: Sequence[Array], tolerance: float, solving: Solving) -> list[str]:
     """What DDP says of states, by the plan of all that comes nearest to holding the constraints."""
     ddp, p = DDP(ocp, intervals=INTERVALS), starts.p if ocp.np else None
-    plans = [solve_globally(ddp, starts.x, p=p, starts=STARTS, rounds=1, seed=0, workers=1, progress=False)]
+
+    def spread(what: str) -> dict[str, Any]:
+        out = None if solving.out is None else solving.out / "possible" / what
+        return {"p": p, "workers": solving.workers, "out": out, "progress": solving.progress}
+
+    plans = [solve_globally(ddp, starts.x, starts=STARTS, rounds=1, seed=0, **spread("cold"))]
     goal = ocp.goals(starts.p)[1][:, None]
-    for u in controls:
+    for number, u in enumerate(controls):
         held = u[:, np.arange(INTERVALS) * u.shape[1] // INTERVALS]
         guess = np.ascontiguousarray(np.where(np.isfinite(held), held, goal))
-        plans.append(ddp.solve(starts.x, u=guess, p=p, progress=False))
+        plans.append(ddp.solve(starts.x, u=guess, **spread(f"from-{number}")))
     found = np.any([plan.success for plan in plans], axis=0)
     shares = np.array([_worst(ocp, plan) for plan in plans])  # [plans, B, K + 1, rows]
     return ["" if ok else _told(ocp, shares[:, i], tolerance) for i, ok in enumerate(found)]

@@ -8,9 +8,7 @@ from __future__ import annotations
 
 from nocl.comparisons.report.findings import Promise
 from nocl.comparisons.report.report import Report
-from nocl.comparisons.report.results import (
-    REFERENCE,
-)
+from nocl.comparisons.report.results import REFERENCE
 
 WITHIN = 2.0  # per cent of the best known cost
 CONFIDENCE = 0.99
@@ -32,7 +30,8 @@ def interval(successes: int, n: int, confidence: float) -> tuple[float, float]:
 
 def promises(report: Report, within: float = WITHIN, confidence: float = CONFIDENCE) -> tuple[Promise, ...]:
     """One promise a method, and on a problem with constraints one more, that it holds them. Empty where the states were
-    given: they need to be independent draws. States from which no plan holds the constraints are none of those meant.
+    given: they need to be independent draws. States from which no plan is known that holds the constraints, as a local
+    solver says, are none of those meant.
 
     A state counts where the run violates nothing and costs at most `within` per cent more than the best known cost,
     over all methods here: it is a statement about that cost, not about an optimum that nobody found.
@@ -41,7 +40,7 @@ def promises(report: Report, within: float = WITHIN, confidence: float = CONFIDE
     if report.settings.get("seed") is None or not n:
         return ()
     of = "initial states and parameters of these distributions" if report.ocp.np else Promise.of
-    of += "" if report.counted.all() else " from which a plan holds the constraints"
+    of += "" if report.counted.all() else " from which a plan that holds the constraints is known"
     kept = {within: report.within(within)} | ({None: report.feasible} if report.ocp.constraint_names else {})
     return tuple(Promise(j.name, what, confidence, n, int(good[m].sum()),
                          lower_bound(int(good[m].sum()), n, confidence), of)

@@ -119,6 +119,7 @@ class Solution:
     p: Array | None = None  # [B, np], the parameters of each problem; None where it has none
     V_p: Array | None = None  # [B, np], dJ*/dp; None where there are no parameters
     slack: Array | None = None  # [B, K+1, n], by how much each of NMPC's n soft constraints is exceeded, in its scale
+    cut: NDArray[np.bool_] | None = None  # [B], whether constraints are left between nodes; None where nobody looked
 
     def __len__(self) -> int:
         return len(self.cost)
@@ -192,7 +193,7 @@ class Solution:
         return Solution(**{name: column(name) for name in vars(batches[0])})  # type: ignore[arg-type]
 
     def put(self, rows: Any, other: Solution) -> None:
-        """Overwrite some rows with another batch, in place; what it lacks becomes NaN there."""
+        """Overwrite some rows with another batch, in place; what it lacks becomes NaN there, or False."""
         for name, value in self.arrays().items():
             new = getattr(other, name)
             if name == "message":  # arrays of text are as wide as their longest
@@ -200,7 +201,8 @@ class Solution:
             elif name == "tried":
                 most = max(value.shape[1], other._tried.shape[1])
                 value, new = _widened(value, most), _widened(other._tried, most)
-            value[rows] = np.nan if new is None else new
+            lacking = False if value.dtype == bool else np.nan
+            value[rows] = lacking if new is None else new
             object.__setattr__(self, name, value)
 
     def arrays(self) -> dict[str, Any]:

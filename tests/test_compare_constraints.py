@@ -13,13 +13,16 @@ import nocl
 from nocl.comparisons import compare, study
 from nocl.comparisons.audit import audit
 from nocl.comparisons.disturbances import Disturbances, robustness
+from nocl.comparisons.judging import Judging
 from nocl.comparisons.promise import promises
 from nocl.comparisons.reference import Reference
 from nocl.comparisons.region import region
 from nocl.comparisons.report import limits
+from nocl.comparisons.report.explain import worst
 from nocl.comparisons.report.payload import payload
+from nocl.comparisons.report.results import number
 from nocl.comparisons.report.tables import tables
-from nocl.solvers import LQR, NMPC
+from nocl.solvers import DDP, LQR, NMPC
 
 P, V, U = (ca.SX.sym(name) for name in ("p", "v", "u"))
 CART = nocl.System("cart", x=ca.vertcat(P, V), u=U, xdot=ca.vertcat(V, U), lbu=[-2], ubu=[2], lbx=[-5, -4],
@@ -162,6 +165,32 @@ def test_what_is_missed_has_no_constant_and_no_unit_in_it():
     assert (shifted.gap[1] < report.gap[1] / 50).all()  # which is how a constant hides errors
     _, same = gains(replace(ocp, running=1e6 * ocp.running, terminal=1e6 * ocp.terminal))
     np.testing.assert_allclose(same, missed, rtol=1e-6, atol=1e-6)
+
+
+def test_a_baseline_that_costs_less_than_all_methods_is_the_best_known():
+    ocp = make()
+    report = compare(ocp, {"weak": WEAK}, x0=[[1.0, 0.0], [0.0, 0.0]], progress=False)
+    lqr = nocl.simulate(ocp, LQR(ocp), [[1.0, 0.0]]).cost
+    assert report.best_method == ["a simple baseline", "weak"]  # from rest at the goal both cost nothing
+    assert report.best[0] == report.base[0] == pytest.approx(lqr[0], rel=1e-9)
+    assert report.gap[0, 0] == pytest.approx(100 * (report.cost[0, 0] / lqr[0] - 1), rel=1e-6)
+    assert np.isnan(report.missed[0, 0])
+    assert report.summary()[0]["found_best"] == 1
+    assert f"against {number(lqr[0])} by a simple baseline: " in " ".join(worst(report, 1)[0].sentences)
+    assert payload(report)["best"] == [-1, 0]
+
+
+def test_what_compare_asks_beside_the_methods_is_kept_and_spread_too(tmp_path, monkeypatch):
+    ocp = make(constraints={"track": (-2, P, 1.1)})
+    methods = {"out": policy(lambda p, v, t: 0.5 + 0 * p)}
+    x0 = [[1.0, 0.0], [1.0, 1.5], [0.9, 0.0]]
+    first = compare(ocp, methods, x0=x0, out=tmp_path, workers=2, progress=False)
+    monkeypatch.setattr(Judging, "judge", None)
+    monkeypatch.setattr(DDP, "descend", None)
+    again = compare(ocp, methods, x0=x0, out=tmp_path, progress=False)
+    assert again.impossible == first.impossible
+    assert any(first.impossible)
+    np.testing.assert_array_equal(again.base, first.base)
 
 
 def test_the_baselines_are_held_controls_and_lqr():

@@ -11,9 +11,11 @@ import pytest
 from constrained import PROBLEMS, TIGHT, Problem, Shooting, kkt_residual, rk4_step
 
 import nocl
+from nocl.data import Solution
 from nocl.scales import usual_sizes
 from nocl.solvers import NMPC
 from nocl.solvers.ddp import augmented
+from nocl.solvers.ddp.bank import better
 from nocl.solvers.ddp.constraints import Block, ConstraintRows, rows_of
 from nocl.solvers.ddp.kernel import ddp_source
 from nocl.solvers.ddp.solver import DDP
@@ -215,6 +217,32 @@ def test_margins_hold_constraints_between_nodes():
     assert deepest(of, held) < 0.02 * deepest(of, plain)
     assert (held.cost > plain.cost).all()
     assert (held.cost < 1.05 * plain.cost).all()
+
+
+def corridor(width: float) -> nocl.OCP:
+    """A corridor that swings out by 0.1 between all nodes of a grid of 20: too narrow, nothing stays in it there."""
+    x, u, t = ca.SX.sym("x"), ca.SX.sym("u"), nocl.time()
+    system = nocl.System("walker", x=x, u=u, xdot=u, lbu=[-1], ubu=[1], lbx=[-1], ubx=[1])
+    return nocl.OCP(system, horizon=1.0, running=1 + u**2 + x**2, terminal=0.0, x_goal=[0], u_goal=[0],
+                    initial_states=nocl.Uniform([-0.001], [0.001]), scales={"corridor": 1.0},
+                    constraints={"corridor": (-width, x - 0.1 * ca.sin(20 * ca.pi * t), width)})
+
+
+def test_what_cuts_corners_is_told_and_loses_to_what_does_not():
+    narrow, wide = (DDP(corridor(w), intervals=20, substeps=1, threads=1, between=True).solve([[0.0]])
+                    for w in (0.02, 0.3))
+    assert narrow.success.all()
+    assert "it may cut corners" in narrow.message[0]
+    assert (narrow.cut.tolist(), wide.cut.tolist()) == ([True], [False])
+    assert "corners" not in wide.message[0]
+    dear = replace(wide, cost=narrow.cost + 1)
+    for a, b in ((narrow, dear), (dear, narrow)):
+        assert not better(a, b).cut.any()
+        assert better(a, b).cost == dear.cost
+    none = replace(dear, cost=np.array([np.inf]), success=np.array([False]))
+    for a, b in ((narrow, none), (none, narrow)):
+        assert better(a, b).cost == narrow.cost
+    assert Solution.join([narrow, wide]).cut.tolist() == [True, False]
 
 
 # What cannot be held

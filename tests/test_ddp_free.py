@@ -228,6 +228,19 @@ def test_it_goes_to_files_and_other_processes(tmp_path):
     assert np.array_equal(same.t, s.t)
 
 
+def test_optima_that_damped_sweeps_misjudge_are_found():
+    """Without the second derivatives of f, which damping leaves out, V_TT is negative here."""
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    system = nocl.System("sink", x=x, u=u, xdot=u + 0.8 * ca.sin(x), lbu=[-20], ubu=[20], lbx=[-5], ubx=[5])
+    ocp = nocl.OCP(system, horizon=nocl.Free(0.2, 5), running=1 + u**2, terminal=20 * x**2, x_goal=[0], u_goal=[0],
+                   initial_states=nocl.Uniform([-3], [3]))
+    x0 = np.linspace(-3, 3, 13)[:, None]
+    s, reference = solver(ocp, 40).solve(x0), NMPC(ocp, intervals=40).solve(x0, progress=False)
+    assert (s.message == "converged").all()
+    np.testing.assert_allclose(s.cost, reference.cost, rtol=1e-7, atol=1e-5)
+    np.testing.assert_allclose(s.t[:, -1], reference.t[:, -1], rtol=1e-4)
+
+
 def test_at_the_command_line(tmp_path, capsys):
     file = tmp_path / "fastest.py"
     file.write_text("""import casadi as ca, nocl

@@ -50,30 +50,26 @@ def worst(report: Results, k: int = 5, m: int | None = None) -> list[Explained]:
 
 def _sentences(report: Results, ways: _Ways, m: int, i: int) -> Iterator[str]:
     j, s = report.judged[m], report.judged[m].simulation
-    b = _best(report, i)
+    b = report.best_index(i)
     if not s.reached[i]:
         yield f"{j.name} failed: {s.message[i]}."
     elif not s.success[i]:
         yield f"{j.name} failed: it {s.message[i]}, at a cost of {number(s.cost[i])}."
-    elif b is None:
+    elif not report.best_method[i]:
         yield f"Cost {number(s.cost[i])}; no method has an answer that counts here, so that there is no gap."
     elif b == m:
         yield f"Cost {number(s.cost[i])}, the best known: no other method did better here."
     else:
         yield (f"Cost {number(s.cost[i])} against {number(report.best[i])} by {report.best_method[i]}: "
                f"{percent(max(report.gap[m, i], 0.0))} % more.")
-        yield _lost_where(report, m, b, i)
+        if b is not None:
+            yield _lost_where(report, m, b, i)
     if s.reached[i]:
         yield from _manners(report, m, b, i)
     if b is not None and b != m and s.reached[i]:
         yield ways.compared(m, b, i)
     if b != m:
         yield from _neighbours(report, ways, m, i)
-
-
-def _best(report: Results, i: int) -> int | None:
-    names = [j.name for j in report.judged]
-    return names.index(report.best_method[i]) if report.best_method[i] else None
 
 
 def _lost_where(report: Results, m: int, b: int, i: int) -> str:
@@ -111,10 +107,10 @@ def _neighbours(report: Results, ways: _Ways, m: int, i: int) -> Iterator[str]:
     lone = math.isfinite(median) and median < report.gap[m, i] / 3
     yield (f"{name}'s {count(len(near), 'nearest neighbour')} {what}: "
            + ("this state is on its own." if lone else "a region, not a point."))
-    b = _best(report, i)
+    b = report.best_index(i)
     if b is None or not ways.another(m, b, i):
         return
-    others = [(n, _best(report, n)) for n in near]
+    others = [(n, report.best_index(n)) for n in near]
     if away := sum(c is not None and ways.part(b, i, c, n) for n, c in others):
         yield f"The best known runs of {away} of these {len(near)} part from this state's: basins meet here."
 

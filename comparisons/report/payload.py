@@ -104,9 +104,9 @@ def valued(report: Results) -> Judged | None:
 
 
 def _index(report: Results, i: int) -> int:
-    """Who found the best known cost, -1 where nobody did."""
-    names = [j.name for j in report.judged]
-    return names.index(report.best_method[i]) if report.best_method[i] else -1
+    """The method that found the best known cost, -1 where none did."""
+    found = report.best_index(i)
+    return -1 if found is None else found
 
 
 def _method(report: Results, j: Judged, nodes: int, states: NDArray[np.integer[Any]]) -> dict[str, Any]:

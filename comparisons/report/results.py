@@ -30,6 +30,7 @@ from nocl.support.checks import Array
 
 REFERENCE = "reference"  # the name of a yardstick among the methods: its speed is no method's
 NOISE = 1e-9  # of a cost: gains that are less are the judge's rounding
+BASELINE = "a simple baseline"  # a control that is held, or LQR: see comparisons/baselines.py
 WIDTH = 118  # characters of a line in the terminal
 Mask = NDArray[np.bool_]
 
@@ -151,9 +152,21 @@ class Results:
 
     @cached_property
     def best(self) -> Array:
-        """[B], the least judged cost of a run that violated nothing; NaN where there is none."""
-        least = self.cost.min(axis=0)
+        """[B], the least judged cost of a run that violated nothing, simple baselines' too; NaN where there is none."""
+        least = np.where(self.beaten, self._base, self.cost.min(axis=0))
         return np.where(np.isfinite(least), least, np.nan)
+
+    @property
+    def _base(self) -> Array:
+        return np.full(len(self.x0), np.nan) if self.base is None else self.base
+
+    @cached_property
+    def beaten(self) -> Mask:
+        """[B], where a simple baseline costs less than all methods."""
+        least, base = self.cost.min(axis=0), self._base
+        with np.errstate(invalid="ignore"):
+            less = least - base > NOISE * (np.abs(base) + np.abs(least))
+        return np.asarray(np.isfinite(base) & (np.isposinf(least) | less))
 
     @cached_property
     def counted(self) -> Mask:
@@ -161,13 +174,19 @@ class Results:
         and nobody did better.
         """
         said = np.array([bool(why) for why in self.impossible or [""] * len(self.x0)], dtype=bool)
-        return np.asarray(~said | self.feasible.any(axis=0))
+        return np.asarray(~said | self.feasible.any(axis=0) | np.isfinite(self._base))
 
     @cached_property
     def best_method(self) -> list[str]:
-        """[B], who found it ("" where nobody did); the first named where two are equal."""
-        who = self.cost.argmin(axis=0)
-        return [self.judged[m].name if math.isfinite(b) else "" for m, b in zip(who, self.best, strict=True)]
+        """[B], who found it, BASELINE or "" where no method did; the first named where two are equal."""
+        who = [BASELINE if beaten else self.judged[m].name for m, beaten in
+               zip(self.cost.argmin(axis=0), self.beaten, strict=True)]
+        return [name if math.isfinite(best) else "" for name, best in zip(who, self.best, strict=True)]
+
+    def best_index(self, i: int) -> int | None:
+        """The method that found the best known cost of state i; None where none did."""
+        names = [j.name for j in self.judged]
+        return names.index(self.best_method[i]) if self.best_method[i] not in ("", BASELINE) else None
 
     @cached_property
     def gap(self) -> Array:
@@ -180,10 +199,8 @@ class Results:
     @cached_property
     def gainful(self) -> Mask:
         """[B], where a simple baseline is known that costs more than the best known run."""
-        if self.base is None:
-            return np.zeros(len(self.x0), dtype=bool)
         with np.errstate(invalid="ignore"):
-            return np.asarray(self.base - self.best > NOISE * (np.abs(self.base) + np.abs(self.best)))
+            return np.asarray(self._base - self.best > NOISE * (np.abs(self._base) + np.abs(self.best)))
 
     @cached_property
     def missed(self) -> Array:
@@ -191,8 +208,7 @@ class Results:
 
         inf where a run failed, NaN where nothing can be gained, no baseline is feasible, or the state does not count.
         """
-        base = np.full(len(self.x0), np.nan) if self.base is None else self.base
-        room = np.where(self.gainful, base - self.best, np.nan)
+        room = np.where(self.gainful, self._base - self.best, np.nan)
         with np.errstate(invalid="ignore"):
             missed = 100 * (self.cost - self.best) / room
         return np.where(self.counted & self.gainful, missed, np.nan)
@@ -305,8 +321,8 @@ def notes(report: Results) -> list[str]:
         said.append(f"From {n - known} of {count(n, 'state')} no such baseline reaches the horizon and holds all "
                     "constraints: there the gap to the best known cost alone is given.")
     if beaten := int((c & (report.base <= report.best)).sum()):
-        said.append(f"On {beaten} of {count(n, 'state')} no method costs less than such a baseline: what is best known "
-                    "there is a method's, and may be far from the optimum.")
+        said.append(f"On {beaten} of {count(n, 'state')} no method costs less than such a baseline, whose cost is the "
+                    "best known there, and may be far from the optimum.")
     return [*NOTE, *said]
 
 

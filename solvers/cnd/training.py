@@ -305,7 +305,7 @@ class Training:
             if self.held is not None:
                 row |= self._violations(starts, tails) | {"infeasible": cannot_hold(fresh)}
             if s.control_dt:
-                best = extend(self.ddp, self.bank, starts.x[:, 0], p=starts.p)
+                best = extend(self.plain, self.bank, starts.x[:, 0], p=starts.p)  # without margins
                 held = at_rate(self.net, self.ocp.horizon / s.intervals)
                 row |= summary(held_gap(held, self.in_torch, best, self.substeps), "held")
             bar.set_postfix_str(f"gap {100 * row['gap_median']:.3f} %, p95 {100 * row['gap_p95']:.3f} %, "

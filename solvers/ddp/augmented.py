@@ -136,11 +136,15 @@ class Augmented(Work):
 
     def _stuck(self, rows: Rows) -> None:
         """If more damping finds nothing to gain either, it is this round's minimum: rounding or a kink hides more."""
-        self.refused[rows] = np.maximum(self.refused[rows], self.mu[rows])
+        self._refuse(rows)
         super()._stuck(rows)
 
     def _at_saddle(self, rows: Rows) -> None:
-        """Held, it is one of the problem; else a larger rho may bend the merit upwards."""
+        """Held, it is one of the problem; else a larger rho may bend the merit upwards. Damped sweeps leave out second
+        derivatives: whether it is none is for a sweep without damping to say."""
+        said = self.undamped[rows]
+        self.refused[rows[~said]], self.mu[rows[~said]] = -1.0, 0.0
+        rows = rows[said]
         done = self._held(rows) | (self.penalty[rows, 0] >= LARGEST * self.unit)
         self.state[rows[done]] = NOT_CONVEX
         rows = rows[~done]
@@ -163,6 +167,10 @@ class Augmented(Work):
     def _cost(self) -> Array:
         """J; where constraints are elastic, with the price of what is left."""
         return self.J if self.ddp.constraints == "elastic" else self.parts[:, 0]
+
+    def promise(self) -> Array:
+        """The cost, and what is violated by one price for all: each problem has a rho of its own."""
+        return self.parts[:, 0] + MOST * self.unit * self.parts[:, 1] / self.penalty[:, 0]
 
     def _last_sweep(self, *values: Array | None) -> None:
         """Active rows are stiff in it, so that gains keep to them: V_x is the same, V_xx and gains are not."""

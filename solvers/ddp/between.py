@@ -38,11 +38,23 @@ class Dips:
         end[:, :count] = np.where(self.rows.end.equal[:count], 0.0, of_x[:, :count])
         return np.ascontiguousarray(np.concatenate([margin[:, :K].reshape(B, K * n), end], axis=1))
 
+    def left(self, t: Array, x: Array, u: Array, p: Array) -> Array:
+        """[B], by how much of its scale a plan violates the worst inequality of its stages, between nodes too."""
+        least = np.where(self.rows.stage.equal, 0.0, np.min(self._values(t, x, u, p), axis=0))
+        over: Array = np.maximum(-least, 0.0).reshape(len(u), -1).max(axis=1, initial=0.0)
+        return over
+
     def _dips(self, t: Array, x: Array, u: Array, p: Array) -> Array:
         """[B, K, rows of a stage], >= 0."""
+        values = self._values(t, x, u, p)
+        ends = np.minimum(values[0], values[-1])
+        return np.maximum(ends - np.min(values, axis=0), 0.0).reshape(*u.shape[:2], -1)
+
+    def _values(self, t: Array, x: Array, u: Array, p: Array) -> list[Array]:
+        """The rows [B K, rows of a stage] at the ends of all parts of intervals."""
         B, K, nu = u.shape
         part = np.repeat((t[:, 1] - t[:, 0]) / INSIDE, K)
-        now, states, controls = t[:, :-1].ravel(), x[:, :-1].reshape(B * K, -1), u.reshape(B * K, nu)
+        now, states, controls = t[:, :-1].ravel(), x[:, :-1].reshape(B * K, x.shape[2]), u.reshape(B * K, nu)
         data = np.repeat(p, K, axis=0)
         values = []
         for j in range(INSIDE + 1):
@@ -50,8 +62,7 @@ class Dips:
             values.append(_at_once(self.c, here))
             if j < INSIDE:
                 states = _at_once(self.step, [*here, part[None]])
-        ends = np.minimum(values[0], values[-1])
-        return np.maximum(ends - np.min(values, axis=0), 0.0).reshape(B, K, -1)
+        return values
 
 
 def _at_once(function: ca.Function, columns: list[Array]) -> Array:

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from nocl.constraints import TOLERANCE
 from nocl.data import Solution
 from nocl.functions import Functions
 from nocl.ocp import OCP
@@ -185,13 +186,15 @@ class DDP:
         """Solve one piece of a batch, here."""
         work = self._work(batch.x0, batch.t0, batch.guess, batch.p)
         work.descend()
-        if self.between and isinstance(work, Augmented):
-            self._exchange(work)
-        return work.solution(batch.curvature)
+        if not (self.between and isinstance(work, Augmented)):
+            return work.solution(batch.curvature)
+        self._exchange(work)
+        return replace(work.solution(batch.curvature), cut=work.cut)
 
     def attempt(self, x0: Array, t0: ArrayLike = 0.0, *, p: Array | None = None, iterations: int = 1,
                 **guess: Array) -> tuple[Array, Array]:
-        """(cost [B], u [B, K, nu]) after so many iterations from a guess of `solve`'s, to choose among guesses by."""
+        """(cost [B] with a price of violations, u [B, K, nu]) after so many iterations from a guess of `solve`'s: what
+        to choose among guesses by."""
         brief = self._with_threads(self.threads)
         brief.settings = replace(self.settings, max_iterations=iterations)
         cost, controls = np.empty(len(x0)), np.empty((len(x0), self.intervals, self.ocp.system.nu))
@@ -199,15 +202,17 @@ class DDP:
             work = brief._work(batch.x0, batch.t0, batch.guess, batch.p)
             work.descend()
             here = slice(batch.first, batch.first + batch.size)
-            cost[here], controls[here] = work.J, work.u
+            cost[here], controls[here] = work.promise(), work.u
         return cost, controls
 
     def _exchange(self, work: Augmented) -> None:
         """Hold constraints between nodes, by margins at them."""
         dips = Dips(_functions(self.posed, self.dynamics), self.rows)
+        t = work.t0[:, None] + work.h[:, None] * np.arange(self.intervals + 1)
         for _ in range(EXCHANGES):
-            t = work.t0[:, None] + work.h[:, None] * np.arange(self.intervals + 1)
             work.exchange(work.with_margin(dips.margins(t, work.x, work.u, work.p)))
+        if (rows := np.flatnonzero(work.cut)).size:
+            work.cut[rows] = dips.left(t[rows], work.x[rows], work.u[rows], work.p[rows]) > TOLERANCE
 
     def rollout(self, x0: Array, p: Array | None = None, **guess: Array) -> Array:
         """The states [B, K+1, nx] from x0 [B, nx] at t0 = 0 under a guess of `solve`'s: where the descent begins.

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -95,6 +95,7 @@ class Work:
         self.most = np.full(B, self.ddp.settings.max_iterations)
         self.state = np.zeros(B, dtype=np.int64)  # an index of MESSAGES
         self.refused = np.full(B, -1.0)  # the largest mu at which the last sweep's trajectory was not convex
+        self.undamped = np.zeros(B, dtype=bool)  # whether that was so without damping, too
         timed = [self.t0] if ocp.uses_time else []
         self.data = [np.column_stack([*timed, self.p])] if timed or ocp.np else []  # what the kernel calls d_
         u = np.repeat(ocp.goals(self.p)[1][:, None], K, axis=1) if self.guess_u is None else self.guess_u
@@ -139,11 +140,16 @@ class Work:
             self.iterations[rows] += 1
             self.backward(rows)
             good, bad = rows[self.positive[rows] > 0], rows[self.positive[rows] == 0]
-            self.refused[bad] = np.maximum(self.refused[bad], self.mu[bad])
+            self._refuse(bad)
             self._damp(bad)
             small = -(self.slope[good] + self.curve[good]) <= self._little(good)
             self._settle(good[small])
             self._line_search(good[~small])
+
+    def _refuse(self, rows: Rows) -> None:
+        """No step with this damping, about these trajectories."""
+        self.refused[rows] = np.maximum(self.refused[rows], self.mu[rows])
+        self.undamped[rows] |= self.mu[rows] == 0
 
     def _little(self, rows: Rows) -> Array:
         """A predicted decrease of J that counts as none."""
@@ -174,7 +180,7 @@ class Work:
 
     def _take(self, rows: Rows) -> None:
         self.x[rows], self.u[rows], self.J[rows] = self.new_x[rows], self.new_u[rows], self.new_J[rows]
-        self.refused[rows] = -1.0
+        self.refused[rows], self.undamped[rows] = -1.0, False
 
     def _line_search(self, rows: Rows) -> None:
         """Halve each problem's step until J falls by a share of what was predicted; damp those that never do."""
@@ -211,7 +217,7 @@ class Work:
         nx = self.x.shape[2]
         V, V_x = np.zeros((B, K + 1)), np.zeros((B, K + 1, nx))
         V_xx = np.zeros((B, K + 1, nx, nx)) if curvature else None
-        known = {"p": self.p, "V_p": np.zeros_like(self.p)} if self.ddp.posed.np else {}
+        known: dict[str, Any] = {"p": self.p, "V_p": np.zeros_like(self.p)} if self.ddp.posed.np else {}
         self._last_sweep(V, V_x, V_xx, known.get("V_p"))
         t = self.t0[:, None] + self.h[:, None] * np.arange(K + 1)
         message = self._messages(t)
@@ -223,6 +229,10 @@ class Work:
                         **known)
 
     def _cost(self) -> Array:
+        return self.J
+
+    def promise(self) -> Array:
+        """What plans that are not at their ends yet are compared by [B]."""
         return self.J
 
     def _last_sweep(self, *values: Array | None) -> None:
