@@ -139,6 +139,12 @@ class Solution:
                         np.full(B, "not tried"), np.zeros(B), np.zeros(B, dtype=np.int64), **known)
 
     @property
+    def rank(self) -> NDArray[np.int64]:
+        """[B], by which solutions are chosen before their costs: 0; 1 of those that cut corners; 2 of failed ones."""
+        cut = np.zeros(len(self), dtype=bool) if self.cut is None else self.cut
+        return np.where(np.isposinf(self.cost), 2, cut)
+
+    @property
     def costate(self) -> Array:
         """V_x by its other name."""
         return self.V_x

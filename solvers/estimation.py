@@ -1,8 +1,10 @@
 """Parameters of the plant estimated while it runs, and laws u(x, t, p) that act on the estimate.
 
-Recursive least squares in p: an extended Kalman filter whose state is p and whose measurement is the state after an
-interval (Ljung (1999), "System Identification", 2nd ed., ch. 11). What is not excited is not learned: it stays at the
-nominal value, and its variance says so.
+Nonlinear least squares over all that was measured, solved again with each measurement: Gauss-Newton on one-step
+predictions, from the box of p as prior (Ljung (1999), "System Identification", 2nd ed., ch. 10). An extended Kalman
+filter in p, which keeps the slopes of former estimates, is sure of wrong values where few states say much: a
+cart-pole's length after one interval. What is not excited is not learned: it stays at the nominal value, and its
+variance says so.
 """
 
 from __future__ import annotations
@@ -22,7 +24,28 @@ from nocl.translate.rk4 import rk4_cost
 
 NOISE = 1e-3  # of half the width of X: what a measured state is off by, unless said otherwise
 OUTLIER = 5.0  # standard deviations of an innovation, from where on it counts less: a kick is no change of mass
+STEPS = 8  # of Gauss-Newton for a measurement, at most
+ENOUGH = 0.01  # standard deviations: a step that is less is the last
+SHORTER = 0.25  # times a step that did not help
 SAME_TIME = 1e-6  # of an interval
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Measurements of B runs, the latest last."""
+
+    x: Array  # [m, B, nx]
+    u: Array  # [m, B, nu]
+    after: Array  # [m, B, nx]
+    t: Array  # [m]
+
+    def and_then(self, x: Array, u: Array, after: Array, t: float) -> Seen:
+        """One more."""
+        return Seen(np.concatenate([self.x, x[None]]), np.concatenate([self.u, u[None]]),
+                    np.concatenate([self.after, after[None]]), np.append(self.t, t))
+
+    def __getitem__(self, rows: slice) -> Seen:
+        return Seen(self.x[rows], self.u[rows], self.after[rows], self.t[rows])
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +54,9 @@ class Estimate:
 
     p: Array  # [B, np of the system]
     covariance: Array  # [B, np, np]
+    seen: Seen
+    mean: Array  # [B, np], of what is known without them, in half widths of the box from the nominal value
+    information: Array  # [B, np, np], the same
 
     @property
     def std(self) -> Array:
@@ -53,11 +79,14 @@ class ParameterEstimator:
         of X.
     substeps : int
         RK4 steps of a prediction.
+    memory : int
+        How many measurements are kept as they are; of older ones what they said, to first order.
 
     Raises ValueError for systems without parameters.
     """
 
-    def __init__(self, ocp: OCP, dt: float, *, noise: ArrayLike | None = None, substeps: int = 4) -> None:
+    def __init__(self, ocp: OCP, dt: float, *, noise: ArrayLike | None = None, substeps: int = 4,
+                 memory: int = 100) -> None:
         checks.problem(ocp, "ParameterEstimator")
         s, owner = ocp.system, "ParameterEstimator"
         if not s.np:
@@ -66,34 +95,106 @@ class ParameterEstimator:
         off = NOISE * (s.ubx - s.lbx) / 2 if noise is None else checks.vector(noise, s.nx, "noise", owner)
         if not (off > 0).all():
             raise ValueError(f"{owner}: noise is {checks.shown(noise)}; expected numbers > 0, one for each state")
-        self.noise = off
+        self.noise, self.memory = off, checks.whole(memory, "memory", owner, 1)
         low, high = (bound[:s.np] for bound in ocp.parameter_box)
         self.low, self.high, self.half = low, high, (high - low) / 2
+        self.nominal = np.clip(ocp.nominal[:s.np], low, high)
         self._predict = _prediction(ocp, self.dt, checks.whole(substeps, "substeps", owner, 1))
 
     def start(self, n: int) -> Estimate:
         """Before anything is measured, for n runs."""
-        p = np.tile(np.clip(self.ocp.nominal[:self.ocp.system.np], self.low, self.high), (n, 1))
-        return Estimate(p, np.tile(np.diag(self.half**2), (n, 1, 1)))
+        s = self.ocp.system
+        nothing = Seen(np.zeros((0, n, s.nx)), np.zeros((0, n, s.nu)), np.zeros((0, n, s.nx)), np.zeros(0))
+        return Estimate(np.tile(self.nominal, (n, 1)), np.tile(np.diag(self.half**2), (n, 1, 1)), nothing,
+                        np.zeros((n, s.np)), np.tile(np.eye(s.np), (n, 1, 1)))
 
     def update(self, estimate: Estimate, x: Array, u: Array, after: Array, t: float = 0.0) -> Estimate:
-        """The estimate once states `after` [B, nx] are measured, dt after x [B, nx] at t, under u [B, nu] meanwhile."""
-        nx, q = self.ocp.system.nx, self.ocp.system.np
-        predicted = self._predict(x.T, u.T, t, estimate.p.T).full()
-        expected, H = predicted[:nx].T, predicted[nx:].T.reshape(-1, q, nx).transpose(0, 2, 1)
-        share = np.where(self.half > 0, self.half, 1.0)  # no width: known for certain, its variance is 0
-        H, e = H / self.noise[:, None] * share, (after - expected) / self.noise  # in units of noise and of the box
-        P = estimate.covariance / np.outer(share, share)
-        spread = H @ P @ H.transpose(0, 2, 1)  # of what is expected, by what is not known of p
-        size = np.einsum("bi,bi->b", e, np.linalg.solve(spread + np.eye(nx), e[..., None])[..., 0]) / nx
-        doubt = np.maximum(size / OUTLIER**2, 1.0)[:, None, None]  # of the measurement: Huber's weight, inverted
-        gain = np.linalg.solve(spread + doubt * np.eye(nx), H @ P).transpose(0, 2, 1)
-        keep = np.eye(q) - gain @ H
-        P = keep @ P @ keep.transpose(0, 2, 1) + doubt * gain @ gain.transpose(0, 2, 1)  # Joseph's form
-        moved = estimate.p + share * (gain @ e[..., None])[..., 0]
-        fine = np.isfinite(moved).all(axis=1)  # a state that blew up tells nothing
-        p = np.where(fine[:, None], np.clip(moved, self.low, self.high), estimate.p)
-        return Estimate(p, np.where(fine[:, None, None], P * np.outer(share, share), estimate.covariance))
+        """The estimate once states `after` [B, nx] are measured, dt after x [B, nx] at t, under u [B, nu] meanwhile.
+
+        A state that is not finite tells nothing.
+        """
+        seen, mean, information = estimate.seen.and_then(x, u, after, t), estimate.mean, estimate.information
+        z, P = self._in_box(estimate.p), estimate.covariance / np.outer(*(self._width,) * 2)
+        if len(seen.t) > self.memory:
+            mean, information = self._folded(seen[:1], z, P, mean, information)
+            seen = seen[1:]
+        fine = np.isfinite(np.c_[x, u, after]).all(axis=1)
+        found, covariance = self._fitted(z, P, seen, mean, information)
+        p = np.where(fine[:, None], np.clip(self.nominal + self.half * found, self.low, self.high), estimate.p)
+        covariance = np.where(fine[:, None, None], covariance * np.outer(self.half, self.half), estimate.covariance)
+        return Estimate(p, covariance, seen, mean, information)
+
+    @property
+    def _width(self) -> Array:
+        """Half widths, 1 of what is known for certain."""
+        return np.where(self.half > 0, self.half, 1.0)
+
+    def _in_box(self, p: Array) -> Array:
+        """p in half widths of the box from the nominal value."""
+        return np.asarray((p - self.nominal) / self._width)
+
+    def _fitted(self, z: Array, P: Array, seen: Seen, mean: Array, information: Array) -> tuple[Array, Array]:
+        """(z, its covariance) of least squares, from z and P [B, np, np] of the estimate before."""
+        e, H = self._residuals(z, seen)
+        w = _weights(e, H, P)
+        step, P = _newton(z, e, H, w, mean, information)
+        for _ in range(STEPS):
+            if (np.abs(step) <= ENOUGH * np.sqrt(np.einsum("bii->bi", P))).all():
+                break
+            trial = np.clip(z + step, self._in_box(self.low), self._in_box(self.high))
+            there, slopes = self._residuals(trial, seen)
+            less = _misfit(trial, there, w, mean, information) <= _misfit(z, e, w, mean, information)
+            z, e = np.where(less[:, None], trial, z), np.where(less[:, None], there, e)
+            H = np.where(less[:, None, None], slopes, H)
+            w = np.where(less, _weights(e, H, P), w)
+            onward, P = _newton(z, e, H, w, mean, information)
+            step = np.where(less[:, None], onward, SHORTER * step)
+        return np.clip(z + step, self._in_box(self.low), self._in_box(self.high)), P
+
+    def _residuals(self, z: Array, seen: Seen) -> tuple[Array, Array]:
+        """What predictions are off by [m, B, nx], in units of noise, and their slopes in z [m, B, nx, np]; 0 where they
+        are not finite."""
+        (m, B, nx), q = seen.x.shape, self.ocp.system.np
+        columns = [np.reshape(v, (m * B, v.shape[2])).T for v in (seen.x, seen.u)]
+        p = np.tile(self.nominal + self.half * z, (m, 1)).T
+        predicted = self._predict(*columns, np.repeat(seen.t, B)[None], p).full()
+        expected, H = predicted[:nx].T.reshape(m, B, nx), predicted[nx:].T.reshape(m, B, q, nx).swapaxes(2, 3)
+        e, H = (seen.after - expected) / self.noise, H / self.noise[:, None] * self.half
+        fine = np.isfinite(e).all(axis=2) & np.isfinite(H).all(axis=(2, 3))
+        return np.where(fine[..., None], e, 0.0), np.where(fine[..., None, None], H, 0.0)
+
+    def _folded(self, seen: Seen, z: Array, P: Array, mean: Array, information: Array) -> tuple[Array, Array]:
+        """(mean, information) of what is known, with what measurements say to first order about z."""
+        e, H = self._residuals(z, seen)
+        w = _weights(e, H, P)
+        more = information + np.einsum("mb,mbip,mbiq->bpq", w, H, H)
+        ahead = e + np.einsum("mbip,bp->mbi", H, z - mean)
+        return mean + _solved(more, np.einsum("mb,mbip,mbi->bp", w, H, ahead)), more
+
+
+def _weights(e: Array, H: Array, P: Array) -> Array:
+    """[m, B], what measurements count for: Huber's weight of how far they are off for what is not known of z."""
+    nx = e.shape[2]
+    spread = np.eye(nx) + H @ P @ H.swapaxes(2, 3)
+    size = np.einsum("mbi,mbi->mb", e, _solved(spread, e)) / nx
+    return np.asarray(1 / np.maximum(size / OUTLIER**2, 1.0))
+
+
+def _newton(z: Array, e: Array, H: Array, w: Array, mean: Array, information: Array) -> tuple[Array, Array]:
+    """(the step [B, np] of Gauss-Newton, the covariance there [B, np, np])."""
+    A = information + np.einsum("mb,mbip,mbiq->bpq", w, H, H)
+    slope = np.einsum("bpq,bq->bp", information, mean - z) + np.einsum("mb,mbip,mbi->bp", w, H, e)
+    return _solved(A, slope), np.linalg.inv(A)
+
+
+def _misfit(z: Array, e: Array, w: Array, mean: Array, information: Array) -> Array:
+    """[B], what least squares make small."""
+    off = z - mean
+    return np.asarray(np.einsum("bp,bpq,bq->b", off, information, off) + np.einsum("mb,mbi->b", w, e**2))
+
+
+def _solved(A: Array, b: Array) -> Array:
+    return np.asarray(np.linalg.solve(A, b[..., None])[..., 0])
 
 
 def _prediction(ocp: OCP, dt: float, substeps: int) -> ca.Function:

@@ -219,11 +219,18 @@ class Search:
             self.costs.append(tried[known])
             np.add.at(self.seconds, rows, s.seconds)
             np.add.at(self.iterations, rows, s.iterations)
-            order = np.lexsort((s.cost, rows))
+            order = np.lexsort((s.cost, s.rank, rows))
             state, first = np.unique(rows[order], return_index=True)
-            best = order[first]
-            won = (s.cost[best] < self.best.cost[state]) | ~self.best.success[state]
-            self.best.put(state[won], s[best[won]])
+            self._take_better(state, s[order[first]])
+
+    def _take_better(self, state: Rows, s: Solution) -> None:
+        """What is better than the best so far of these states, or follows a failure."""
+        if s.cut is not None and self.best.cut is None:
+            self.best = replace(self.best, cut=np.zeros(len(self.x0), dtype=bool))
+        former = self.best[state]
+        cheaper = (s.rank == former.rank) & (s.cost < former.cost)
+        won = (s.rank < former.rank) | cheaper | ~former.success
+        self.best.put(state[won], s[won])
 
     def _tried(self) -> Array:
         """The cost that each start ended at [B, most], NaN where there were fewer."""

@@ -1,4 +1,4 @@
-"""Parameters estimated on line: the filter against recursive least squares and truth, and laws that act on it."""
+"""Parameters estimated on line: against Bayes in closed form and the truth, and laws that act on it."""
 
 import casadi as ca
 import numpy as np
@@ -7,6 +7,7 @@ from scipy.integrate import solve_ivp
 
 import nocl
 from nocl.solvers.estimation import Adaptive, ParameterEstimator
+from nocl.systems import cartpole
 
 DT = 0.1
 
@@ -53,19 +54,40 @@ def test_exact_measurements_give_the_parameters():
     assert (found.std < 1e-3 * filter_.start(3).std).all()
 
 
-def test_it_is_the_posterior_of_least_squares_where_the_model_is_linear_in_p():
+@pytest.mark.parametrize("memory", [100, 2])  # what is forgotten is kept to first order: here that is all
+def test_it_is_the_posterior_of_least_squares_where_the_model_is_linear_in_p(memory):
     """With friction known to be 0, the state after an interval is affine in 1 / m: the mean and variance of Bayes."""
     ocp = cart(parameters=nocl.Uniform([0.5, 0.0, -1], [1.5, 0.0, 1]))
     x, u = record(ocp, np.array([[1.2, 0.0]]), 6)
     noise = np.array([0.3, 0.2])
     noisy = x + noise * np.random.default_rng(1).standard_normal(x.shape) / 10
-    found = run(ParameterEstimator(ocp, DT, noise=noise), noisy, u)
+    found = run(ParameterEstimator(ocp, DT, noise=noise, memory=memory), noisy, u)
     slope = np.stack([u[:, 0, 0] * DT**2 / 2, u[:, 0, 0] * DT], axis=1)
     rest = noisy[1:, 0] - noisy[:-1, 0] - np.stack([noisy[:-1, 0, 1] * DT, np.zeros(6)], axis=1)
     information = 1 / 0.5**2 + ((slope / noise) ** 2).sum()
     mean = (1.0 / 0.5**2 + (slope * rest / noise**2).sum()) / information
     assert found.p[0, 0] == pytest.approx(mean, rel=1e-9)
     assert found.covariance[0, 0, 0] == pytest.approx(1 / information, rel=1e-9)
+
+
+def test_it_is_not_sure_of_wrong_values_where_p_acts_nonlinearly():
+    """A cart-pole's length is in every entry of its accelerations, the other constants in quotients."""
+    units: dict[str, tuple[float, float]] = {"l": (0.7, 1.3), "m_pole": (0.07, 0.13), "gain": (2.1, 3.9)}
+    constants = [nocl.parameter(name, sum(box) / 2) for name, box in units.items()]
+    system = cartpole.system(**dict(zip(units, constants, strict=True)), parameters=ca.vertcat(*constants))
+    low, high = zip(*units.values(), strict=True)
+    ocp = nocl.OCP.quadratic(system, horizon=4.0, x_goal=[0, 0, 0, 0], u_goal=[0],
+                             initial_states=nocl.Gaussian([0, 0, np.pi, 0], [0.1] * 4),
+                             parameters=nocl.Uniform(low, high))
+    p, noise = ocp.sample_parameters(20, 3), np.array([1e-5, 1e-4, 1e-5, 1e-4])
+    x, u = record(ocp, p, 12)
+    filter_ = ParameterEstimator(ocp, DT, noise=noise, substeps=8)
+    known, rng = filter_.start(20), np.random.default_rng(4)
+    for k in range(12):
+        after = x[k + 1] + noise * rng.standard_normal((20, 4))
+        known = filter_.update(known, x[k], u[k], after, k * DT)
+        assert (np.abs(known.p - p) < 4.5 * known.std + 1e-12).all()
+    assert (known.std < 0.05 * filter_.half).all()
 
 
 def test_units_of_states_change_nothing():
@@ -139,6 +161,7 @@ def test_what_is_refused():
             (lambda: ParameterEstimator(ocp, DT, noise=[1.0, 0.0]), "noise is"),
             (lambda: ParameterEstimator(ocp, DT, noise=[1.0]), "noise"),
             (lambda: ParameterEstimator(ocp, DT, substeps=0), "substeps is 0"),
+            (lambda: ParameterEstimator(ocp, DT, memory=0), "memory is 0"),
             (lambda: Adaptive(3, filter_), "law is a int"),
             (lambda: Adaptive(lambda x, t, p: x, 3), "estimator"),
             (lambda: nocl.simulate(ocp, Adaptive(lambda x, t, p: x[:, :1], filter_), [0, 0], p=[1, 0.1, 0], hold=5),

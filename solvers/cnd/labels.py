@@ -112,7 +112,8 @@ def rivals(ddp: DDP, bank: SolutionBank, rng: np.random.Generator) -> bool:
     at = Problems.initial(ddp.ocp, PROBED, rng)
     one = extend(ddp, bank, at.x, 1, p=at.given_p).cost
     others = extend(ddp, bank, at.x, NEIGHBOURS, p=at.given_p, kept=KEPT).cost
-    return float((others < one - SAME * np.abs(one)).mean()) > RARE
+    least = np.where(np.isfinite(one), one - SAME * np.abs(np.nan_to_num(one, posinf=0.0)), np.inf)
+    return float((others < least).mean()) > RARE
 
 
 @dataclass(frozen=True, eq=False)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from nocl.constraints import TOLERANCE
 from nocl.scales import usual_sizes
+from nocl.solvers.between import CUTS
 from nocl.solvers.ddp.batch import Rows
 from nocl.solvers.ddp.work import BLEW_UP, CONVERGED, NOT_CONVEX, NOT_HELD, OUTSIDE, RUNNING, Work
 from nocl.support.checks import Array
@@ -196,7 +197,7 @@ class Augmented(Work):
             else:
                 message[i] += f"; {name!r} is left, {where}"
         for i in np.flatnonzero(self.cut):
-            message[i] += "; between nodes it may cut corners, margins there could not be held"
+            message[i] += CUTS
         return message
 
     def _violations(self) -> tuple[Array, Array]:

@@ -222,18 +222,11 @@ def _cheapest(ddp: DDP, x0: Array, t0: ArrayLike, p: Array | None, guesses: list
 def better(a: Solution, b: Solution) -> Solution:
     """The cheaper of two solutions of each problem, with the seconds and iterations of both; of two of which one cuts
     corners between nodes the other, even if it costs more."""
-    both, (of_a, of_b) = b.arrays(), (_rank(s) for s in (a, b))
-    swap = (of_b < of_a) | (of_b == of_a) & (b.cost < a.cost)
+    both, swap = b.arrays(), (b.rank < a.rank) | (b.rank == a.rank) & (b.cost < a.cost)
     best = Solution(**{name: value.copy() for name, value in a.arrays().items() if name in both})
     best.put(swap, b[swap])
     tried = None if a.tried is None or b.tried is None else np.c_[a.tried, b.tried]
     return replace(best, seconds=a.seconds + b.seconds, iterations=a.iterations + b.iterations, tried=tried)
-
-
-def _rank(s: Solution) -> Rows:
-    """0 for solutions, 1 for those that cut corners, 2 for none [B]."""
-    cut = np.zeros(len(s), dtype=bool) if s.cut is None else s.cut
-    return np.where(np.isposinf(s.cost), 2, cut)
 
 
 def _places(x: Array, p: Array | None) -> Array:

@@ -70,6 +70,14 @@ class ConstraintRows:
         block, i = (self.stage, row - node * n) if node < intervals else (self.end, row - intervals * n)
         return block.names[i], node, float(block.scales[i])
 
+    def margins(self, at_nodes: Array, u: ca.SX) -> Array:
+        """[B, rows of a plan], from those of a stage's rows at all nodes [B, K+1, rows of a stage]."""
+        B, nodes, n = at_nodes.shape
+        of_x, end = at_nodes[:, -1][:, self.of_x(u)], np.zeros((B, len(self.end)))
+        count = min(of_x.shape[1], end.shape[1])
+        end[:, :count] = np.where(self.end.equal[:count], 0.0, of_x[:, :count])
+        return np.ascontiguousarray(np.concatenate([at_nodes[:, :-1].reshape(B, (nodes - 1) * n), end], axis=1))
+
     def end_own(self, u: ca.SX) -> Mask:
         """The end's rows that are no stage's [n]."""
         return np.arange(len(self.end)) >= self.of_x(u).sum()

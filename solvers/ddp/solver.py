@@ -27,9 +27,9 @@ from nocl.constraints import TOLERANCE
 from nocl.data import Solution
 from nocl.functions import Functions
 from nocl.ocp import OCP
+from nocl.solvers.between import EXCHANGES, Dips
 from nocl.solvers.ddp.augmented import Augmented
 from nocl.solvers.ddp.batch import Job, Piece, assembled, pieces
-from nocl.solvers.ddp.between import EXCHANGES, Dips
 from nocl.solvers.ddp.constraints import ConstraintRows, rows_of
 from nocl.solvers.ddp.free import FreeTime, lifted, with_horizons
 from nocl.solvers.ddp.kernel import ddp_source, pack_weights
@@ -207,10 +207,12 @@ class DDP:
 
     def _exchange(self, work: Augmented) -> None:
         """Hold constraints between nodes, by margins at them."""
-        dips = Dips(_functions(self.posed, self.dynamics), self.rows)
+        stage, u = self.rows.stage, self.posed.functions.arguments["u"]
+        dips = Dips(_functions(self.posed, self.dynamics), stage.c, stage.equal)
         t = work.t0[:, None] + work.h[:, None] * np.arange(self.intervals + 1)
         for _ in range(EXCHANGES):
-            work.exchange(work.with_margin(dips.margins(t, work.x, work.u, work.p)))
+            margin = self.rows.margins(dips.margins(t, work.x, work.u, work.p), u)
+            work.exchange(work.with_margin(margin))
         if (rows := np.flatnonzero(work.cut)).size:
             work.cut[rows] = dips.left(t[rows], work.x[rows], work.u[rows], work.p[rows]) > TOLERANCE
 

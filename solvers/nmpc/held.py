@@ -42,6 +42,11 @@ class Block:
         """Upper bounds of the rows [m]; the lower ones are 0."""
         return np.where(self.rows.equal, 0.0, np.inf)
 
+    def inward(self, margin: Array) -> Array:
+        """The lower bounds of the rows with margins [m], in scales, as the solver sees them."""
+        held = ~self.rows.equal & ~self.slack.any(axis=1)
+        return np.asarray(np.where(held, margin * self.scales / self.unit, 0.0))
+
     def excess(self, c: Array) -> Array:
         """How far values c [m, n] exceed the rows, as shares of their scales."""
         return np.asarray(np.maximum(-self.rows.signed(c), 0.0) / self.scales[:, None])

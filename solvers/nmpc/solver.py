@@ -62,6 +62,8 @@ class NMPC:
     constraints : "hard": all constraints at the nodes, those that hold the control at the start of each interval, under
         its control, and those of the end at the last node; "soft": the penalty of ocp.L_soft in the cost instead, where
         all are inequalities of (x, t, p)
+    between : whether hard inequalities hold between nodes too, all but exactly: by margins at the nodes, exchanged
+        twice, each time for as much as the plan dips between them
     soft : names of constraints that an exact penalty holds: they are held where they can be, and exceeded where not, by
         as little as may be; `cost` has the penalty in it, and the Solution's `slack` says by how much
     seed : of the random starts
@@ -87,6 +89,7 @@ class NMPC:
     passes: int = field(default=4, kw_only=True)
     neighbours: int = field(default=3, kw_only=True)
     constraints: str = field(default="hard", kw_only=True)
+    between: bool = field(default=False, kw_only=True)
     soft: Sequence[str] = field(default=(), kw_only=True)
     seed: int = field(default=0, kw_only=True)
     time_limit: float | None = field(default=None, kw_only=True)
@@ -100,6 +103,7 @@ class NMPC:
                 checks.whole(getattr(self, name), name, "NMPC", least)
         checks.whole(self.seed, "seed", "NMPC", most=2**63)
         checks.word(self.constraints, ("hard", "soft"), "constraints", "NMPC")
+        checks.flag(self.between, "between", "NMPC")
         self._check_soft()
         if not isinstance(self.solver, str) or (self.solver not in BACKENDS and not _known(self.solver)):
             raise ValueError(f"NMPC: solver is {self.solver!r}; expected {' or '.join(BACKENDS)}, or an nlpsol "
@@ -152,7 +156,7 @@ class NMPC:
         options = sorted((self.options or {}).items())
         return fingerprint(self.ocp.to_data(), self.dynamics, self.terminal,
                            int(self.intervals), int(self.substeps or 0), self.constraints, self.solver, options,
-                           *([list(self.soft)] if self.soft else []))
+                           *([list(self.soft)] if self.soft else []), *([self.between] if self.between else []))
 
     @property
     def program(self) -> Transcription:
@@ -451,6 +455,8 @@ class _States:
         self.x0, self.t, self.p = call.x0, call.t, call.p
         self.refusal = [violated_start(nmpc.program, x, self.t[0], p) for x, p in zip(self.x0, self.p, strict=True)]
         self.failed: list[Answer | None] = [None] * len(self.x0)  # of each state's solves that failed, by rank
+        held = nmpc.program.held
+        self.between = nmpc.between and bool(len(held.x) + len(held.u))
 
     def begin(self, stage: int, what: str) -> None:
         self.number, self.what = stage - 1, what
@@ -460,7 +466,7 @@ class _States:
         name, begun = (f"fresh-{self.number}", True) if self.number else ("start", False)
         given, warm = ([], 0) if begun else (self.call.given, self.call.warm)
         tasks = [Task(f"{name}-{i:06d}", i, self.x0[i], self.t, [guess[i] for guess in given], warm, first, count,
-                      self.nmpc.seed, self.nmpc.time_limit, p=self._own(i)) for i in rows]
+                      self.nmpc.seed, self.nmpc.time_limit, self._own(i), self.between) for i in rows]
         return self._do(tasks)
 
     def _own(self, i: int) -> Array | None:
@@ -476,7 +482,7 @@ class _States:
             if "t" in made:
                 guesses = [(*one, t) for one, t in zip(guesses, made["t"], strict=True)]
             tasks.append(Task(f"round-{self.number}-{i:06d}", int(i), self.x0[i], self.t, guesses,
-                              time_limit=self.nmpc.time_limit, p=self._own(i)))
+                              time_limit=self.nmpc.time_limit, p=self._own(i), between=self.between))
         return self._do(tasks)
 
     def _do(self, tasks: Sequence[Task]) -> Found:
@@ -487,7 +493,7 @@ class _States:
             if failed is not None and (best is None or failed.rank < best.rank):
                 self.failed[outcome.row] = failed
         yield np.array([o.row for o in outcomes], dtype=np.int64), \
-            solved_by(self.nmpc.ocp, self.t, outcomes, self.p)
+            solved_by(self.nmpc.ocp, self.t, outcomes, self.p, self.between)
 
     def finished(self, found: Solution) -> Solution:
         """What the search found, with V, what solution(t) interpolates, and messages."""

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from nocl.constraints import PATH
+from nocl.constraints import PATH, TOLERANCE
 from nocl.data import Solution
 from nocl.ocp import OCP
+from nocl.solvers.between import CUTS, EXCHANGES
 from nocl.solvers.nmpc.guesses import Guess
 from nocl.solvers.nmpc.transcription import (
     FEASIBLE,
@@ -41,6 +42,7 @@ class Task:
     seed: int = 0
     time_limit: float | None = None  # seconds of each solve
     p: Array | None = None  # [np], where there are parameters
+    between: bool = False  # whether constraints are held between nodes too
     size: int = 1  # states
 
     def outcome(self, arrays: dict[str, Any]) -> Outcome:
@@ -87,10 +89,12 @@ def attempt(program: Transcription, task: Task, guesses: Sequence[Guess]) -> Out
         answers.append(warm if warm is not None and warm.success else program.solve(*one))
     answers += _second_opinion(program, task, answers)
     answers += _third_opinion(program, task, answers)
+    if task.between:
+        answers = [_between(program, task, a) if a.success else a for a in answers]
     seconds = time.perf_counter() - begin
     good, bad = ([a for a in answers if bool(a.success) is ok] for ok in (True, False))
     return Outcome(task.name, task.row, np.array([a.cost for a in answers]), seconds,
-                   sum(a.iterations for a in answers), min(good, key=lambda a: a.cost, default=None),
+                   sum(a.iterations for a in answers), min(good, key=lambda a: (a.cut, a.cost), default=None),
                    min(bad, key=lambda a: a.rank, default=None))
 
 
@@ -141,8 +145,34 @@ def _third_opinion(program: Transcription, task: Task, answers: Sequence[Answer]
     return [replace(near, success=False, cost=np.inf, outcome=NOT_HELD, violation=most, message=why)]
 
 
-def solved_by(ocp: OCP, t: Array, outcomes: Sequence[Outcome], p: Array | None = None) -> Solution:
-    """What tasks on the nodes t [N+1] found, a row each; NaN where a task found nothing. p [B, np] of all states."""
+def _between(program: Transcription, task: Task, answer: Answer) -> Answer:
+    """The answer, solved again with the margins that it needs between nodes; as it was where they cannot be held."""
+    own, iterations = np.zeros((1, 0)) if task.p is None else task.p[None], answer.iterations
+    for _ in range(EXCHANGES):
+        t = task.t if answer.t is None else answer.t
+        plan = (t[None], answer.x[None], answer.u[None], own)
+        again = _inside(program, task, t, answer, program.dips.margins(*plan)[0])
+        iterations += again.iterations
+        if not again.success:
+            cut = bool(program.dips.left(*plan)[0] > TOLERANCE)
+            return replace(answer, iterations=iterations, cut=cut, message=answer.message + (CUTS if cut else ""))
+        answer = replace(again, iterations=iterations)
+    return answer
+
+
+def _inside(program: Transcription, task: Task, t: Array, start: Answer, margin: Array) -> Answer:
+    """Solved from a solution without these margins: with a small barrier, or if that fails with the usual one."""
+    one = (task.x0, t, start.x, start.u, task.time_limit, task.p, margin)
+    warm = program.warm.solve(*one)
+    return warm if warm.success else program.solve(*one)
+
+
+def solved_by(ocp: OCP, t: Array, outcomes: Sequence[Outcome], p: Array | None = None,
+              between: bool = False) -> Solution:
+    """What tasks on the nodes t [N+1] found, a row each; NaN where a task found nothing. p [B, np] of all states.
+
+    between : whether constraints were held between nodes too
+    """
     own = None if p is None else p[[o.row for o in outcomes]]
     found = Solution.blank(np.tile(t, (len(outcomes), 1)), ocp.system.nx, ocp.system.nu, own)
     tried = np.full((len(outcomes), max((len(o.costs) for o in outcomes), default=0)), np.nan)
@@ -155,7 +185,9 @@ def solved_by(ocp: OCP, t: Array, outcomes: Sequence[Outcome], p: Array | None =
                 found.t[i] = outcome.best.t
             if found.V_p is not None and outcome.best.V_p is not None:
                 found.V_p[i] = outcome.best.V_p
-    return replace(found, tried=tried, message=np.array([o.best.message if o.best else "" for o in outcomes], np.str_),
+    cut = np.array([o.best is not None and o.best.cut for o in outcomes], dtype=bool)
+    message = np.array([o.best.message if o.best else "" for o in outcomes], np.str_)
+    return replace(found, tried=tried, cut=cut if between else None, message=message,
                    seconds=np.array([o.seconds for o in outcomes]),
                    iterations=np.array([o.iterations for o in outcomes], dtype=np.int64))
 

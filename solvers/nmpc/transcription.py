@@ -23,6 +23,7 @@ import numpy as np
 from nocl.functions import Functions
 from nocl.ocp import OCP
 from nocl.scales import steps, units
+from nocl.solvers.between import Dips
 from nocl.solvers.nmpc.held import Block, Layout, layout
 from nocl.support import compiler
 from nocl.support.checks import Array
@@ -70,6 +71,7 @@ class Answer:
     outcome: str  # how it ended: a key of OUTCOMES, GIVEN_UP, or CasADi's own name
     V_p: Array | None = None  # [np], dJ*/dp, where there are parameters
     t: Array | None = None  # [N+1], the nodes, where the horizon is free
+    cut: bool = False  # whether constraints are left between nodes
 
     @property
     def rank(self) -> tuple[int, float]:
@@ -281,6 +283,18 @@ class Transcription:
         return {"lbx": np.concatenate(lbx) / self.scales.w, "ubx": np.concatenate(ubx) / self.scales.w,
                 "lbg": np.zeros(len(ubg)), "ubg": ubg}
 
+    def inside(self, margin: Array) -> Array:
+        """Lower bounds of the rows of g with margins [N+1, rows along the trajectory], in scales; soft rows have none.
+        """
+        held, N, n = self.held, self.N, self.functions.rows.n_x
+        of_rows, nx = {id(held.x): slice(0, n), id(held.u): slice(n, None)}, self.ocp.system.nx
+        parts = [np.zeros(nx + self.free)]
+        for k in range(N + 1):
+            parts += [np.zeros(nx * (k == 0) + (nx + self.free) * (0 < k < N))]
+            parts += [np.zeros(len(block)) if block is held.end else block.inward(margin[k, of_rows[id(block)]])
+                      for block in held.at(k, N)]
+        return np.concatenate(parts)
+
     @cached_property
     def _limits(self) -> dict[str, ca.DM]:
         """The bounds as CasADi takes them: converting them at each solve would take a millisecond."""
@@ -307,16 +321,17 @@ class Transcription:
         return [row for stage in stages for row in stage] + [(what, N) for what in held[N]]
 
     def solve(self, x0: Array, t: Array, x: Array, u: Array, time_limit: float | None = None,
-              p: Array | None = None) -> Answer:
+              p: Array | None = None, margin: Array | None = None) -> Answer:
         """Solve from x0 on the nodes t [N+1] with the guess x [N+1, nx], u [N, nu], in a copy of this process.
 
         p : the parameters [np], where there are some
         time_limit : seconds; default: `patience`, from what other solves took
+        margin : by which each row is held further inside at each node, in scales [N+1, rows along the trajectory]
         """
         begin = time.perf_counter()
         try:
             answer: Answer = self._guarded(self.patience if time_limit is None else time_limit, x0, t, x, u,
-                                            np.zeros(0) if p is None else p)
+                                            np.zeros(0) if p is None else p, margin)
         except NoAnswerError as error:
             return self._no_answer(t, x, u, f"was given up: {error}")
         self._took[0] = max(self._took[0], time.perf_counter() - begin)
@@ -407,10 +422,11 @@ class Transcription:
             i = int(np.flatnonzero(block.slack[:, j])[0])
             slacks[:, j] = np.maximum(np.sign(block.slack[i, j]) * need[i], 0.0)
 
-    def _solve(self, x0: Array, t: Array, x: Array, u: Array, own: Array) -> Answer:
+    def _solve(self, x0: Array, t: Array, x: Array, u: Array, own: Array, margin: Array | None) -> Answer:
         w0, ends = self._start(t, x, u, own), t / t[-1] if self.free else t
+        limits = self._limits if margin is None else {**self._limits, "lbg": ca.DM(self.inside(margin))}
         try:
-            result = self.solver(x0=w0 / self.scales.w, p=np.r_[x0, np.diff(ends), ends[-1], own], **self._limits)
+            result = self.solver(x0=w0 / self.scales.w, p=np.r_[x0, np.diff(ends), ends[-1], own], **limits)
         except RuntimeError as error:  # of the library: it fails one start, not the batch
             return self._no_answer(t, x, u, f"ended with an error: {str(error).strip().splitlines()[-1]}")
         return self._answer(result, self.solver.stats(), ends, own)
@@ -467,6 +483,12 @@ class Transcription:
         row = int(np.argmax(excess))
         what, node = self.row_titles[row]
         return float(excess[row]), f"{excess[row] * self.scales.g[row]:.3g} of {what} at node {node}, t = {t[node]:.4g}"
+
+    @cached_property
+    def dips(self) -> Dips:
+        """What its constraints along the trajectory dip by between nodes."""
+        of = self.functions
+        return Dips(of, of.rows.column / ca.DM(of.scales), of.rows.equal)
 
     @cached_property
     def elastic(self) -> Transcription:
