@@ -57,7 +57,7 @@ def _outside(ocp: OCP, starts: Starts, tolerance: float) -> list[str]:
 
 def _asked(ocp: OCP, starts: Starts, controls: Sequence[Array], tolerance: float, solving: Solving) -> list[str]:
     """What DDP says of states, by the plan of all that comes nearest to holding the constraints."""
-    ddp, p = DDP(ocp, intervals=INTERVALS), starts.p if ocp.np else None
+    ddp, p = DDP(ocp, intervals=INTERVALS, between=False), starts.p if ocp.np else None
 
     def spread(what: str) -> dict[str, Any]:
         out = None if solving.out is None else solving.out / "possible" / what

@@ -13,7 +13,7 @@ from constrained import PROBLEMS, TIGHT, Problem, Shooting, kkt_residual, rk4_st
 import nocl
 from nocl.data import Solution
 from nocl.scales import usual_sizes
-from nocl.solvers import NMPC
+from nocl.solvers import NMPC, solve_globally
 from nocl.solvers.ddp import augmented
 from nocl.solvers.ddp.bank import better
 from nocl.solvers.ddp.constraints import Block, ConstraintRows, rows_of
@@ -217,6 +217,15 @@ def test_margins_hold_constraints_between_nodes():
     assert deepest(of, held) < 0.02 * deepest(of, plain)
     assert (held.cost > plain.cost).all()
     assert (held.cost < 1.05 * plain.cost).all()
+
+
+def test_a_global_search_holds_them_between_nodes_unless_told_otherwise():
+    of = problem("point")
+    x0 = [[-2.5, 0.2, 0.0, 0.0], [-2.2, -0.1, 0.1, 0.0]]
+    found = [solve_globally(solver(of, 20, **said), x0, starts=2, rounds=0) for said in ({}, {"between": False})]
+    assert deepest(of, found[0]) < 0.02 * deepest(of, found[1])
+    assert found[0].cut.tolist() == [False, False]
+    assert found[1].cut is None
 
 
 def corridor(width: float) -> nocl.OCP:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import nocl
 from nocl.cli import main
-from nocl.solvers import NMPC
+from nocl.solvers import DDP, NMPC
 
 P, V, U = ca.SX.sym("p"), ca.SX.sym("v"), ca.SX.sym("u")
 SERIAL = {"workers": 1, "progress": False}
@@ -350,6 +350,49 @@ def test_outcomes_are_kept_with_their_horizons(tmp_path):
     first, again = (nmpc.solve([[1.0, 0.0], [1.5, 0.0]], out=tmp_path, **SERIAL) for _ in range(2))
     for name in ("t", "x", "u", "cost", "V_x", "seconds"):
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
+
+
+def point():
+    """A point in the plane from rest to rest, around a disc, with a speed limit."""
+    x, y, vx, vy, ax, ay = (ca.SX.sym(name) for name in ("x", "y", "vx", "vy", "ax", "ay"))
+    system = nocl.System("point", x=ca.vertcat(x, y, vx, vy), u=ca.vertcat(ax, ay), xdot=ca.vertcat(vx, vy, ax, ay),
+                         lbu=[-3] * 2, ubu=[3] * 2, lbx=[-4] * 4, ubx=[4] * 4)
+    rest = {f"{name} there": (0, e, 0) for name, e in zip(("x", "y", "vx", "vy"), (x, y, vx, vy), strict=True)}
+    return nocl.OCP(system, horizon=3.0, running=ax**2 + ay**2, terminal=0.0, x_goal=[0] * 4, u_goal=[0, 0],
+                    initial_states=nocl.Uniform([-2.6, -0.3, 0, 0], [-2.0, 0.3, 0, 0]), terminal_constraints=rest,
+                    constraints={"disc": (x + 1)**2 + y**2 - 0.25, "speed": (None, vx**2 + vy**2, 1.2)})
+
+
+def test_margins_hold_constraints_between_nodes_as_those_of_ddp():
+    ocp = point()
+    x0 = ocp.initial_states.sample(3, 1)
+    plain, held = (solver(ocp, between=between, starts=4).solve(x0, **SERIAL) for between in (False, True))
+    ddp = DDP(ocp, intervals=20, substeps=1, threads=1, between=True).solve(x0, u=held.u)
+    left = [solver(ocp).program.dips.left(s.t, s.x, s.u, np.zeros((3, 0))) for s in (plain, held)]
+    assert left[0].min() > 1e-3
+    assert left[1].max() < 2e-5
+    np.testing.assert_allclose(held.cost, ddp.cost, rtol=1e-7)
+    np.testing.assert_allclose(held.V_x, ddp.V_x, atol=1e-4 * np.abs(ddp.V_x).max())
+    assert ((held.cost > plain.cost) & (held.cost < 1.05 * plain.cost)).all()
+    assert not held.cut.any()
+    assert plain.cut is None
+
+
+def test_margins_that_cannot_be_held_are_told(tmp_path):
+    """A corridor that swings out by 0.1 between all nodes."""
+    x, u, t = ca.SX.sym("x"), ca.SX.sym("u"), nocl.time()
+    system = nocl.System("walker", x=x, u=u, xdot=u, lbu=[-1], ubu=[1], lbx=[-1], ubx=[1])
+    ocp = nocl.OCP(system, horizon=1.0, running=1 + u**2 + x**2, terminal=0.0, x_goal=[0], u_goal=[0],
+                   initial_states=nocl.Uniform([-0.001], [0.001]), scales={"corridor": 1.0},
+                   constraints={"corridor": (-0.02, x - 0.1 * ca.sin(20 * ca.pi * t), 0.02)})
+    nmpc = solver(ocp, between=True)
+    first, again = (nmpc.solve([[0.0]], out=tmp_path, **SERIAL) for _ in range(2))
+    for s in (first, again):
+        assert s.success.all()
+        assert s.cut.tolist() == [True]
+        assert s.message[0] == "solved; between nodes it may cut corners, margins there could not be held"
+    soft = solver(ocp, between=True, soft=["corridor"]).solve([[0.0]], **SERIAL)
+    assert soft.success.all()
 
 
 def test_a_loop_holds_constraints_of_the_control():

@@ -47,7 +47,8 @@ def solve_globally(ddp: DDP, x0: ArrayLike, *, p: Any = None, starts: int = 16, 
                    report: OnMessage = lambda _: None) -> Solution:
     """Solve each problem from cold starts, then from its neighbours' solutions until nothing improves.
 
-    nocl.solvers.search says what a round tries.
+    nocl.solvers.search says what a round tries. Hard constraints hold between nodes too, unless the DDP says otherwise
+    (`between`).
 
     Parameters
     ----------
@@ -63,7 +64,7 @@ def solve_globally(ddp: DDP, x0: ArrayLike, *, p: Any = None, starts: int = 16, 
     Returns the best found of each problem; `tried`, `starts`, `hits` and `optima` say how sure that is. Raises
     ValueError for wrong input; a state for which nothing converged has success False.
     """
-    rows, _ = checks.states(x0, ddp.ocp.system.nx, ddp.ocp.system.name)
+    rows, ddp = checks.states(x0, ddp.ocp.system.nx, ddp.ocp.system.name)[0], ddp.as_best_known()
     values = ddp.ocp.parameters_of(p, len(rows), "solve_globally")
     if min(starts + (known is not None), neighbours + 1, rounds + 1) < 1:
         raise ValueError(f"starts is {starts}, neighbours {neighbours}, rounds {rounds}; expected starts >= 1 (0 where "

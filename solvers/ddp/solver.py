@@ -66,9 +66,9 @@ class DDP:
         "elastic": the same, but a violation has a price: where holding them would cost more, they are left by as little
         as pays, and the message says so; the cost has the price in it. "soft": they enter by the OCP's penalty, and
         nothing is held.
-    between : bool
+    between : bool, optional
         Whether they hold between nodes too, all but exactly: by margins at the nodes, exchanged twice, each time for as
-        much as the plan dips between them.
+        much as the plan dips between them. Default: no; but `solve_globally` does so where constraints are hard.
     threads : int, optional
         Default: all cores.
     rows : ConstraintRows, optional
@@ -79,7 +79,7 @@ class DDP:
 
     def __init__(self, ocp: OCP, *, intervals: int = 80, substeps: int | None = None,
                  dynamics: LearnedDynamics | None = None, settings: DDPSettings | None = None,
-                 constraints: str = "hard", between: bool = False, threads: int | None = None,
+                 constraints: str = "hard", between: bool | None = None, threads: int | None = None,
                  cache: str | os.PathLike[str] | None = None, rows: ConstraintRows | None = None) -> None:
         checks.problem(ocp, "DDP")
         for name, value in (("intervals", intervals), ("substeps", 1 if substeps is None else substeps),
@@ -95,7 +95,7 @@ class DDP:
         self.ocp, self.intervals, self.settings = ocp, int(intervals), settings or DDPSettings()
         self.posed = lifted(ocp) if ocp.is_free else ocp  # what the kernel solves
         self.constraints, self.dynamics, self.cache = constraints, dynamics, cache
-        self.between = checks.flag(between, "between", "DDP")
+        self.between = None if between is None else checks.flag(between, "between", "DDP")
         self.margin: Array | None = None  # see `inside`
         self.checked = self.coarse = False  # whether the grid was held against the plant, and is too coarse for it
         self.left = substeps is None  # whether the grid was left to nocl
@@ -204,6 +204,15 @@ class DDP:
             here = slice(batch.first, batch.first + batch.size)
             cost[here], controls[here] = work.promise(), work.u
         return cost, controls
+
+    def as_best_known(self) -> DDP:
+        """The same solver, which holds hard constraints between nodes too, unless it was said whether it does."""
+        if self.between is not None or self.constraints != "hard" or self.rows.stage.equal.all():
+            return self
+        other = self._with_threads(self.threads)
+        other.between = True
+        other.__dict__.pop("key", None)  # it is another solver
+        return other
 
     def _exchange(self, work: Augmented) -> None:
         """Hold constraints between nodes, by margins at them."""
