@@ -6,15 +6,18 @@ import copy
 import dataclasses
 import importlib.util
 import json
+import re
 import subprocess
 import sys
 
 import casadi as ca
 import numpy as np
 import pytest
+import torch
 from test_export import STATES, TIMES, untrained
 
 import nocl
+from nocl.cli import main
 from nocl.exports import parity
 from nocl.exports.bundle import export
 from nocl.exports.c_code import load
@@ -93,6 +96,66 @@ def test_a_failed_export_leaves_a_former_one_as_it_was(exported, tmp_path):
     with pytest.raises(ValueError, match="nothing was written"):
         export(Off(1e-3, "policy"), folder, ("casadi", "c"), against=())
     assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
+
+
+def without_single(monkeypatch):
+    """No float32 form is good enough."""
+    monkeypatch.setitem(parity.LIMITS, "float32", 1e-14)
+
+
+def test_a_form_that_differs_is_left_out_and_explained_and_the_others_are_written(exported, tmp_path, monkeypatch):
+    folder = tmp_path / "run"
+    export(CONTROLLER, folder, ("casadi", "c"), against=())
+    assert (folder / "c_float32" / "cartpole_policy.h").exists()
+    without_single(monkeypatch)
+    certificate = export(CONTROLLER, folder, ("casadi", "c"), against=())
+    assert not certificate.ok
+    assert list(certificate.refused) == ["c_float32"]
+    assert re.match(r"policy: C \(float32\) differs from torch .* limit 1e-14, at", certificate.refused["c_float32"])
+    assert "parity in part" in str(certificate)
+    assert "NOT written: c_float32 (policy: C (float32) differs" in str(certificate)
+    assert all(f.ok for f in certificate.findings)
+    assert {f.dtype for f in certificate.findings} == {"float64"}
+    assert not list((folder / "c_float32").glob("cartpole_*"))  # nor a former one kept beside another's certificate
+    law = load(folder / "c", "cartpole_policy")
+    np.testing.assert_allclose(law(STATES, TIMES), CONTROLLER(STATES, TIMES), atol=1e-12)
+    assert json.loads((folder / "parity.json").read_text())["refused"] == dict(certificate.refused)
+
+
+def test_strict_is_all_or_nothing(tmp_path, monkeypatch):
+    without_single(monkeypatch)
+    with pytest.raises(ValueError, match=r"C \(float32\) differs .*nothing was written"):
+        export(CONTROLLER, tmp_path / "run", ("casadi", "c"), against=(), strict=True)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_line_goes_on_without_a_form_unless_it_is_strict(tmp_path, monkeypatch, capsys):
+    without_single(monkeypatch)
+    CONTROLLER.save(tmp_path / "cnd")
+    command = ["export", str(tmp_path), "--to", "c", "--against", "c"]
+    assert main([*command, "--strict"]) != 0
+    assert not (tmp_path / "export").exists()
+    assert main(command) == 0
+    assert "NOT written: c_float32" in capsys.readouterr().out
+    assert (tmp_path / "export" / "c" / "cartpole_policy.h").exists()
+
+
+@pytest.mark.parametrize("unit", [1e-6, 1e6])
+def test_limits_do_not_depend_on_units(unit):
+    """The same law of a state in other units, whose answer is in other units: the same errors, in values and slopes."""
+    def part(size: float) -> parity.ExportPart:
+        x = ca.MX.sym("x", 2)
+        law = ca.Function("law", [x], [size * ca.vertcat(ca.sin(x[0] / size), x[1] * x[0] / size**2)], ["x"], ["u"])
+
+        def rows(x: torch.Tensor) -> torch.Tensor:
+            u = torch.sin(x[:, :1] / size), x[:, 1:] * x[:, :1] / size**2
+            return size * torch.cat(u, dim=1) * (1 + 1e-9)
+        return parity.ExportPart("law", law, rows, {"x": ([-2 * size, -size], [2 * size, size])})
+
+    errors = [[f.error for f in parity.findings(one, "native", "float64", parity.samples(one),
+                                                *parity.of_casadi(one.column))] for one in (part(1.0), part(unit))]
+    np.testing.assert_allclose(errors[1], errors[0], rtol=1e-3)
+    assert min(errors[0]) > 1e-10
 
 
 def test_nan_is_no_parity():

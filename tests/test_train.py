@@ -51,6 +51,12 @@ def integrator():
     return ocp, nocl.train(ocp, settings=QUICK, seed=0, progress=False)
 
 
+def test_an_export_that_would_differ_is_told_before_training(monkeypatch):
+    monkeypatch.setitem(module.parity.LIMITS, "float64", 1e-20)
+    with pytest.warns(UserWarning, match=r"policy: native CasADi \(float64\) differs .*, before it is trained"):
+        nocl.train(nocl.load_ocp("double_integrator"), settings=replace(TINY, rounds=0, value=False), progress=False)
+
+
 @pytest.fixture(scope="module")
 def pendulum():
     """(ocp, ddp, bank of solutions, f): no training."""

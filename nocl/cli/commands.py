@@ -124,6 +124,8 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--against", type=arguments.forms, metavar="A,B",
                      help=f"what is compared beside them; default: all of {', '.join(arguments.FORMS)} that can be "
                           "made here")
+    sub.add_argument("--strict", action="store_true",
+                     help="write nothing where any form differs; default: the others, with a remark")
     sub.add_argument("--out", type=arguments.folder, metavar="DIR", help="default: RUN/export")
     sub = command("compare", _compare, "compare a run's controller with other methods, initial state by initial state")
     _add(sub, "run", "p", "n", "intervals", "methods")
@@ -278,7 +280,8 @@ def _export(args: argparse.Namespace) -> None:
     cnd = load_run(run, args.p)
     out = args.out if args.out is not None else run / "export"
     arguments.check_out(out)
-    RunFolder(cnd.ocp, run, 0).export(cnd, out, tuple(dict.fromkeys(args.to or ("casadi", "c"))), args.against)
+    forms = tuple(dict.fromkeys(args.to or ("casadi", "c")))
+    RunFolder(cnd.ocp, run, 0).export(cnd, out, forms, args.against, args.strict)
 
 
 def _compare(args: argparse.Namespace) -> None:

@@ -130,12 +130,14 @@ class RunFolder:
         say(f"controller: done, {time.perf_counter() - start:.0f} s")
         return cnd
 
-    def export(self, cnd: CND, out: Path, forms: Sequence[str], against: Sequence[str] | None) -> None:
+    def export(self, cnd: CND, out: Path, forms: Sequence[str], against: Sequence[str] | None,
+               strict: bool = False) -> None:
         """Controller, value function and, where there are any, learned dynamics, with the proof of parity."""
         start = time.perf_counter()
         model = self._dynamics_there() if cnd.card.get("dynamics") == "learned" else None
         say(f"export: {', '.join(forms)} to {out}")
-        certificate = export([cnd] if model is None else [cnd, model], out, forms, against=against)
+        certificate = export([cnd] if model is None else [cnd, model], out, forms, against=against,
+                             strict=strict)
         say(f"export: {certificate}, {time.perf_counter() - start:.1f} s")
 
     def compare(self, cnd: CND, out: Path, methods: Sequence[str], n: int, intervals: int,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,8 @@ from nocl.support.atomic import part_of, remove_parts
 from nocl.support.checks import Array
 from nocl.system import System
 
-FORMS = ("casadi", "l4casadi", "onnx", "c")
+STEPS = {"casadi": ("casadi",), "l4casadi": ("l4casadi",), "onnx": ("onnx",), "c": ("c", "c_float32")}  # of each form
+FORMS = tuple(STEPS)
 PROOF = "parity.json"
 NEEDS = {"l4casadi": ("l4casadi",), "onnx": ("onnx", "onnxruntime")}  # packages
 
@@ -48,7 +49,7 @@ def parts_of(thing: Any) -> list[ExportPart]:
 
 
 def export(thing: Any, folder: str | os.PathLike[str], to: Sequence[str] = ("casadi",), *,
-           against: Sequence[str] | None = None) -> Certificate:
+           against: Sequence[str] | None = None, strict: bool = False) -> Certificate:
     """Write a CND, LearnedDynamics or a list of them to `folder` in the forms of `to`, and prove them equal to it.
 
         folder/NAME.casadi            to="casadi": ca.Function.load reads it
@@ -61,9 +62,11 @@ def export(thing: Any, folder: str | os.PathLike[str], to: Sequence[str] = ("cas
     ----------
     against : what the certificate compares beside native CasADi and the forms of `to`; default: every form whose
         package or compiler is there
+    strict : raise ValueError where any form differs, and leave the folder as it was
 
-    Returns the Certificate; str() of it is one line. All or nothing: where a limit is passed (float64 1e-12, float32
-    1e-5, see nocl.exports.parity) it raises ValueError, and the folder is as it was.
+    Returns the Certificate; str() of it is one line. A form that differs by more than its limit (float64 1e-12, float32
+    1e-5, see nocl.exports.parity) is not written, nor is a former one kept, and the certificate says why (`refused`);
+    the others are. Where none of `to` is left it raises ValueError, and the folder is as it was.
     """
     folder = Path(os.path.abspath(checks.folder(folder, "folder", "export")))
     for form in (*checks.words(to, "to", "export"), *(() if against is None else checks.words(against, "against",
@@ -77,9 +80,12 @@ def export(thing: Any, folder: str | os.PathLike[str], to: Sequence[str] = ("cas
     before = set(lib.glob("*"))
     try:
         with tempfile.TemporaryDirectory(dir=compiler.own_folder()) as scratch:
-            certificate = _Export(parts, new, lib, Path(scratch), _title(thing)).run(to, against, missing)
+            work = _Export(parts, new, lib, Path(scratch), _title(thing))
+            certificate = work.run(to, against, missing)
+        _check_refused(certificate, to, checks.flag(strict, "strict", "export"))
         store.write_json(new / PROOF, certificate.to_data())
         _merge(new, folder)
+        work.drop_former(folder, certificate.refused)
     except BaseException:
         for path in set(lib.glob("*")) - before:
             path.unlink()
@@ -124,6 +130,15 @@ def _folder(folder: Path) -> Path:
         raise ValueError(f"export: {folder} cannot be made ({error.strerror}): name another folder") from error
 
 
+def _check_refused(certificate: Certificate, to: Sequence[str], strict: bool) -> None:
+    """ValueError where nothing is left to be written, or anything differs that must not."""
+    kept = [step for form in to for step in STEPS[form] if step not in certificate.refused]
+    if certificate.refused and (strict or not kept):
+        step, why = next(iter(certificate.refused.items()))
+        raise ValueError(f"export: {why}; nothing was written: what {step} would be is not what was trained. A float32 "
+                         "form may lack the digits for a function this steep: export float64 ones")
+
+
 def _merge(new: Path, folder: Path) -> None:
     """Move all files in, each by one rename."""
     try:
@@ -141,48 +156,63 @@ class _Export:
     def __init__(self, parts: list[ExportPart], new: Path, lib: Path, scratch: Path, title: tuple[str, str]) -> None:
         self.parts, self.new, self.lib, self.scratch, self.title = parts, new, lib, scratch, title
         self.findings: list[Finding] = []
+        self.refused: dict[str, str] = {}
         self.z = {part.name: parity.samples(part) for part in parts}
         self.expected = {part.name: parity.reference_of(part, self.z[part.name]) for part in parts}
 
     def run(self, to: Sequence[str], against: Sequence[str] | None, missing: dict[str, str]) -> Certificate:
         compared = [f for f in FORMS if f in to or f == "casadi" or f in (FORMS if against is None else against)]
         left_out = {f: missing[f] for f in compared if f in missing}
-        for form in compared:
-            if form not in missing:
-                getattr(self, f"_{form}")(form in to)
+        for step in (step for form in compared if form not in missing for step in STEPS[form]):
+            self._step(step, step.split("_")[0] in to)
         points = min(len(z) for z in self.z.values())
         inputs = {name: part.labels[name] for part in self.parts for name in part.casadi.name_in()
                   if name in part.labels}
-        return Certificate(self.findings, points, left_out, inputs)
+        return Certificate(self.findings, points, left_out, inputs, self.refused)
+
+    def _step(self, step: str, keep: bool) -> None:
+        """One kind of files, kept if they are equal to what was trained."""
+        folder, before, libraries = self.scratch / step, len(self.findings), set(self.lib.glob("*"))
+        folder.mkdir()
+        {"casadi": self._casadi, "l4casadi": self._l4casadi, "onnx": self._onnx, "c": self._c,
+         "c_float32": self._c_float32}[step](folder, self.lib if keep else folder)
+        bad = [finding for finding in self.findings[before:] if not finding.ok]
+        if bad:
+            self.refused[step] = str(bad[0])
+            del self.findings[before:]
+            for path in set(self.lib.glob("*")) - libraries:
+                path.unlink()
+        elif keep:
+            shutil.copytree(folder, self.new if step == "casadi" else self.new / step, dirs_exist_ok=True)
+
+    def drop_former(self, folder: Path, refused: Iterable[str]) -> None:
+        """What an earlier export left in the folder of forms that are refused now."""
+        for step in refused:
+            for part in self.parts:
+                name = f"{self.title[0]}_{part.name}[._]*" if step in STEPS["c"] else f"{part.name}.*"
+                for path in (folder if step == "casadi" else folder / step).glob(name):
+                    path.unlink()
 
     def _compare(self, part: ExportPart, backend: str, dtype: str, values: parity.Rows,
                  slopes: parity.Rows | None = None) -> None:
-        found = parity.findings(part, backend, dtype, self.z[part.name], values, slopes, self.expected[part.name])
-        for finding in found:
-            if not finding.ok:
-                raise ValueError(f"export: {finding}; nothing was written: the export is not what was trained. A "
-                                 "float32 form may lack the digits for a function this steep: export float64 ones")
-        self.findings += found
+        self.findings += parity.findings(part, backend, dtype, self.z[part.name], values, slopes,
+                                         self.expected[part.name])
 
-    def _casadi(self, keep: bool) -> None:
+    def _casadi(self, folder: Path, _: Path) -> None:
         for part in self.parts:
             self._compare(part, "native CasADi", "float64", *parity.of_casadi(part.column))
-            if keep:
-                part.casadi.save(str(self.new / f"{part.name}.casadi"))
+            part.casadi.save(str(folder / f"{part.name}.casadi"))
 
-    def _l4casadi(self, keep: bool) -> None:
-        folder = (self.new if keep else self.scratch) / "l4casadi"
-        folder.mkdir()
+    def _l4casadi(self, folder: Path, lib: Path) -> None:
         for part in self.parts:
             if part.net is not None:
                 f = part.casadi
                 built = to_casadi(part.net, backend="l4casadi", name=part.name, in_names=f.name_in(),
-                                  out_names=f.name_out(), build_dir=self.lib if keep else folder)
+                                  out_names=f.name_out(), build_dir=lib)
                 self._compare(part, "L4CasADi", "float32", *parity.of_casadi(built))
                 built.save(str(folder / f"{part.name}.casadi"))
 
-    def _onnx(self, keep: bool) -> None:
-        folder = (self.new if keep else self.scratch) / "onnx"
+    def _onnx(self, folder: Path, _: Path) -> None:
         for part in self.parts:
             if part.net is not None:
                 f = part.casadi
@@ -191,11 +221,13 @@ class _Export:
                 self._compare(part, "ONNX Runtime", "float32", _split(session, part))
                 self._compare(part, "ONNX imported", "float32", *parity.of_casadi(from_onnx(path)))
 
-    def _c(self, keep: bool) -> None:
-        for dtype, name in (("float64", "c"), ("float32", "c_float32")):
-            folder = (self.new if keep else self.scratch) / name
-            for part in self.parts:
-                self._by_c(part, folder, dtype)
+    def _c(self, folder: Path, _: Path) -> None:
+        for part in self.parts:
+            self._by_c(part, folder, "float64")
+
+    def _c_float32(self, folder: Path, _: Path) -> None:
+        for part in self.parts:
+            self._by_c(part, folder, "float32")
 
     def _by_c(self, part: ExportPart, folder: Path, dtype: str) -> None:
         """A function's C against its values; networks also get the C of their Jacobian, in passing."""

@@ -99,7 +99,7 @@ def to_c(function: ca.Function, folder: str | Path, name: str | None = None, *, 
         bad = z[~np.isfinite(values).all(axis=1)][0]
         raise ValueError(f"to_c: {name} is NaN or inf at {bad.tolist()}; expected finite values in the box: shrink its "
                          "bounds")
-    vectors = z, values, _scales(function, inputs, z, values, dtype)
+    vectors = z, values, _scales(function, inputs, z, values)
     files = {f"{name}.h": _header(name, inputs, outputs, REAL[dtype], note),
              f"{name}.c": _source(name, inputs, outputs, REAL[dtype], sizes),
              f"{name}_casadi.c": _first_line(f"{name}_casadi.c") + code,
@@ -273,19 +273,16 @@ def _samples(boxes: Sequence[tuple[Array, Array]], n: int, seed: int) -> Array:
     return np.clip(lower + share * (upper - lower), lower, upper)
 
 
-def _scales(function: ca.Function, inputs: Sequence[_Argument], z: Array, values: Array, dtype: str) -> Array:
-    """What the self-test's errors are relative to, [N, outputs].
-
-    float64: max(1, |output|). float32: the largest output of all vectors (at least 1), and what a change of the inputs,
-    relative to their largest, makes of the output, sum_j |d output / d input_j| max |input_j|: no code is better than
-    the digits of its numbers.
+def _scales(function: ca.Function, inputs: Sequence[_Argument], z: Array, values: Array) -> Array:
+    """What the self-test's errors are relative to, [N, outputs]: the largest output of all vectors, and what a change
+    of the inputs, relative to their largest, makes of it, sum_j |d output / d input_j| max |input_j|, since no code
+    is better than the digits of its numbers; 1 where both are 0.
     """
-    if dtype == "float64":
-        return np.maximum(1, np.abs(values))
     v = ca.MX.sym("z", z.shape[1])
     y = ca.vertcat(*function.call(ca.vertsplit(v, [0, *np.cumsum([a.n for a in inputs]).tolist()])))
     size = ca.Function("size", [v], [ca.densify(ca.mtimes(ca.fabs(ca.jacobian(y, v)), np.abs(z).max(axis=0)))])
-    return np.fmax(max(1.0, np.abs(values).max()), size.map(len(z))(z.T).full().T)
+    scale = np.fmax(np.abs(values).max(axis=0), size.map(len(z))(z.T).full().T)
+    return np.where(scale > 0, scale, 1.0)
 
 
 def _split(z: Array, inputs: Sequence[_Argument]) -> list[Array]:

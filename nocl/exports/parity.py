@@ -1,9 +1,9 @@
 """Is the export the trained one? Values and first derivatives of every backend against torch in float64, by numbers.
 
 Samples: corners of the box and uniform points inside, rounded to float32, so that all backends get the same numbers.
-In float64 an error in a value y is relative to max(1, |y|), and an error in a derivative to the largest derivative over
-the samples (at least 1). In float32 both are relative to the largest over the samples, and to what a change of inputs,
-relative to the size of the box, makes of them, since no code is better than the digits of its numbers.
+An error in a value is relative to the largest of that value over the samples, and to what a change of inputs, relative
+to their own sizes, makes of it, since no code is better than the digits of its numbers; so is an error in a derivative,
+each times the size of its input. Nothing depends on units.
 """
 
 from __future__ import annotations
@@ -81,16 +81,18 @@ class Finding:
 
 @dataclass(frozen=True)
 class Certificate:
-    """What was compared, on how many points, and what was left out and why."""
+    """What was compared, on how many points, what was left out and why, and what was not written, since it differs."""
 
     findings: Sequence[Finding]
     points: int
     left_out: Mapping[str, str] = field(default_factory=dict)
     inputs: Mapping[str, Sequence[str]] = field(default_factory=dict)  # what stands in each, with its unit
+    refused: Mapping[str, str] = field(default_factory=dict)  # by the folder's name of a form
 
     @property
     def ok(self) -> bool:
-        return all(f.ok for f in self.findings)
+        """Whether all that was compared is equal."""
+        return all(f.ok for f in self.findings) and not self.refused
 
     def __str__(self) -> str:
         worst: dict[str, Finding] = {}
@@ -101,15 +103,16 @@ class Certificate:
         figures = ", ".join(f"{key} {f.error:.1e}" for key, f in worst.items())
         parts = ", ".join(dict.fromkeys(f.part for f in self.findings))
         missing = f"; not compared: {', '.join(self.left_out)}" if self.left_out else ""
-        return (f"parity {'ok' if self.ok else 'FAILED'}: {parts} against torch float64 on {self.points} points, "
-                f"largest error: {figures}{missing}")
+        refused = "".join(f"; NOT written: {form} ({why})" for form, why in self.refused.items())
+        return (f"parity {'ok' if self.ok else 'in part'}: {parts} against torch float64 on {self.points} points, "
+                f"largest error: {figures}{missing}{refused}")
 
     def to_data(self) -> dict[str, Any]:
         """As plain JSON data."""
         rows = [{**vars(f), "at": dict(f.at), "ok": f.ok} for f in self.findings]
+        inputs = {name: list(labels) for name, labels in self.inputs.items()}
         return {"summary": str(self), "ok": self.ok, "points": self.points, "left_out": dict(self.left_out),
-                "limits": LIMITS, "inputs": {name: list(labels) for name, labels in self.inputs.items()},
-                "findings": rows}
+                "refused": dict(self.refused), "limits": LIMITS, "inputs": inputs, "findings": rows}
 
 
 def samples(part: ExportPart, n: int = 192, corners: int = 64, seed: int = 0) -> Array:
@@ -131,7 +134,7 @@ def reference_of(part: ExportPart, z: Array) -> Reference:
     """Values and derivatives by torch in float64, and what changes of z, relative to the box, make of the latter."""
     y, J = of_torch(part, z)
     signs = np.random.default_rng(1).choice([-1.0, 1.0], (TRIALS, z.shape[1]))
-    size = np.abs(z).max(axis=0)
+    size = _sizes(z)
     change = [np.abs(of_torch(part, np.clip(z + STEP * size * s, z.min(axis=0), z.max(axis=0)))[1] - J) / STEP
               for s in signs]
     return y, J, np.max(change, axis=0)
@@ -167,24 +170,24 @@ def of_casadi(function: ca.Function) -> tuple[Rows, Rows]:
 def findings(part: ExportPart, backend: str, dtype: str, z: Array, values: Rows, slopes: Rows | None = None,
              reference: Reference | None = None) -> list[Finding]:
     """A backend's largest errors in values, and in first derivatives where it has them."""
-    y, J, change = reference or reference_of(part, z)
-    found = [_finding(part, backend, dtype, "value", z, values(z) - y, value_scale(z, y, J, dtype))]
+    (y, J, change), size = reference or reference_of(part, z), _sizes(z)
+    scale = np.maximum(np.abs(y).max(axis=0), np.abs(J) @ size)
+    found = [_finding(part, backend, dtype, "value", z, values(z) - y, scale)]
     if slopes is not None:
-        scale = np.maximum(1, np.abs(J).max(axis=(0, 2), keepdims=True))
-        scale = scale if dtype == "float64" else np.maximum(scale, change.max(axis=2, keepdims=True))
-        found.append(_finding(part, backend, dtype, "first derivatives", z, slopes(z) - J, scale))
+        J, off, bent = J * size, (slopes(z) - J) * size, change * size
+        scale = np.maximum(np.abs(J).max(axis=(0, 2), keepdims=True)[0].T, bent.max(axis=2))
+        found.append(_finding(part, backend, dtype, "first derivatives", z, off, scale[..., None]))
     return found
 
 
-def value_scale(z: Array, y: Array, J: Array, dtype: str) -> Array:
-    """What an error in values y [N, m] is relative to; J [N, m, n] are their derivatives at z [N, n]."""
-    if dtype == "float64":
-        return np.maximum(1, np.abs(y))
-    return np.maximum(max(1.0, np.abs(y).max()), np.abs(J) @ np.abs(z).max(axis=0))
+def _sizes(z: Array) -> Array:
+    """[n], what inputs z [N, n] are in size; 1 of one that is 0 throughout."""
+    size: Array = np.abs(z).max(axis=0)
+    return np.where(size > 0, size, 1.0)
 
 
 def _finding(part: ExportPart, backend: str, dtype: str, of: str, z: Array, difference: Array, scale: Array) -> Finding:
-    error = (np.abs(difference) / scale).reshape(len(z), -1).max(axis=1)
+    error = (np.abs(difference) / np.where(scale > 0, scale, 1.0)).reshape(len(z), -1).max(axis=1)
     worst = int(np.argmax(np.where(np.isnan(error), np.inf, error)))
     parts = np.split(z[worst], np.cumsum(part.sizes)[:-1])
     at = {name: v.tolist() if len(v) > 1 else float(v[0]) for name, v in zip(part.casadi.name_in(), parts, strict=True)}

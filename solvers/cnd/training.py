@@ -29,6 +29,7 @@ import torch
 from tqdm import tqdm
 
 from nocl.data import Solution
+from nocl.exports import parity
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
 from nocl.sampling import own_numbers
@@ -74,6 +75,7 @@ VALUE_LARGE = 0.05  # mean |V - J*| / J* that a warning is given above
 VALUE_HELD_OUT = 16  # times held_out: a mean of relative errors hangs on the few states that are hard
 MARGINS = 2  # rounds that begin with new margins, where there are constraints
 LOSSES = 40  # of each regression that the card keeps
+REHEARSED = (16, 16)  # points inside the box, and corners, at which an export is tried before training
 
 
 def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "default",
@@ -177,6 +179,7 @@ class Training:
         if not self._resume():
             self._first_labels()
             self._network()
+            self._rehearse_export()
         while self.round <= s.rounds and not self._good_enough():
             if self.round:
                 self._move_margins()
@@ -241,6 +244,15 @@ class Training:
             self.net, self.inverse = policy_net(self.ocp, self.labels[: self.first], self.settings.hidden,
                                                 self.settings.control_dt, self.own, self.settings.branches)
         self.policy = at_rate(self.net, 0.0) if self.settings.control_dt else self.net  # in continuous time
+
+    def _rehearse_export(self) -> None:
+        """Warns, before the long part, where CasADi does not answer as the policy does."""
+        part = CND(self.ocp, self.net, None, {}).export_parts()[0]
+        z = parity.samples(part, *REHEARSED)
+        found = parity.findings(part, "native CasADi", "float64", z, *parity.of_casadi(part.column))
+        if bad := [finding for finding in found if not finding.ok]:
+            warnings.warn(f"{self.ocp.system.name}: {bad[0]}, before it is trained: what leaves nocl would not be what "
+                          "is trained here: write the problem without branches that rounding decides", stacklevel=5)
 
     def _move_margins(self) -> None:
         """New margins by what the policy violated, and all labels solved again with them."""
