@@ -19,6 +19,7 @@ from nocl.functions import Functions
 from nocl.sampling import Distribution, Gaussian, Seed, Uniform, box, short
 from nocl.smoothness import kinks, linear_controls
 from nocl.support import checks
+from nocl.support.asked import answered
 from nocl.support.checks import MALFORMED, Array, Vector
 from nocl.system import System, check_unique, counted, parameter_text, read, refusal
 from nocl.translate import instructions
@@ -33,6 +34,7 @@ FEW = 5  # parameters, beside the usual ones, that constraints are tried at
 N_IMAGES, SAME_IMAGE = 16, 1e-9  # points of the box; relative to usual values, images that agree so far are one
 
 
+@answered
 @dataclass(frozen=True, eq=False, repr=False)
 class OCP:
     """min_u int_0^T L(x, u) dt + G(x(T)), subject to xdot = f(x, u), u in U, and constraints along the way and at T.

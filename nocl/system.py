@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 
 from nocl import parameters, pretty
 from nocl.support import checks
+from nocl.support.asked import answered
 from nocl.support.checks import MALFORMED, Array, Vector
 from nocl.translate import instructions
 from nocl.translate.arguments import Arguments
@@ -24,6 +25,7 @@ N_SAME, SAME = 16, 1e-9  # points, and relative to usual values: equations that 
 N_PROBES = 512  # points of the box at which the equations are tried on construction
 
 
+@answered
 @dataclass(frozen=True, eq=False, repr=False)
 class System:
     """xdot = f(x, u, t, p), x in the box [lbx, ubx] of R^nx, u in [lbu, ubu] of R^nu; t and p where f has them.

@@ -273,3 +273,16 @@ def test_table_look_ups_are_refused_at_once(kind):
     with pytest.raises(ValueError, match="running contains OP_CALL"):
         nocl.OCP(plain, horizon=1.0, running=a**2 + table(p), terminal=p**2, x_goal=[0, 0], u_goal=[0],
                  initial_states=nocl.Gaussian([1, 0], [0.1, 0.1]))
+
+
+@pytest.mark.parametrize(("word", "way"), [
+    ("delay", "a few more states, each a first-order lag"), ("integrality", "one problem for each mode"),
+    ("alg", "solve the equations for z within it"), ("sample_time", "hold=K"), ("outputs", "put an observer before it"),
+    ("noise", "robust=True"), ("du_max", "nocl.limit_rates"), ("x_max", 'state_bounds={"v": (-2, 2)}'),
+    ("angle", "units: did you mean angles?"), ("colour", "expected name, x, u, xdot, lbu")])
+def test_what_there_is_not_is_answered(word, way):
+    with pytest.raises(ValueError, match=f"^System: {word} is no argument") as said:
+        make(**{word: 1})
+    assert way in str(said.value)
+    with pytest.raises(ValueError, match=f"^OCP: {word} is no argument"):
+        nocl.OCP(make(), **{word: 1})
