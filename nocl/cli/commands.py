@@ -96,6 +96,8 @@ def parser() -> argparse.ArgumentParser:
         return sub
 
     command("list", _list, "the problems that come with nocl")
+    sub = command("doctor", _doctor, "examine a problem in half a minute: goal, controllability, stiffness, optima")
+    _add(sub, "problem", "p", "seed", "intervals")
     sub = command("run", _run, "identify, train, export, solve by NMPC, compare and report, in one go")
     _add(sub, "problem", "p", "out", "seed", "n", "exact", "effort", "quick", "intervals", "methods")
     sub = command("identify", _identify, "learn the dynamics, from the equations or from logged trajectories")
@@ -198,6 +200,16 @@ def _problem(args: argparse.Namespace) -> tuple[OCP, Path]:
     out = args.out if args.out is not None else Path("runs") / name
     arguments.check_out(out)
     return ocp, out
+
+
+def _doctor(args: argparse.Namespace) -> None:
+    from nocl.comparisons.diagnosis import doctor
+
+    ocp = load_ocp(args.problem)
+    found = doctor(ocp if args.p is None else ocp.at(args.p), args.intervals, args.seed)
+    print(found)
+    if not found.ok:
+        raise ValueError(f"doctor: {sum(one.verdict == 'PROBLEM' for one in found.findings)} problem(s), named above")
 
 
 def _check_learnable(ocp: OCP) -> None:

@@ -1,0 +1,246 @@
+"""`nocl doctor`: what can be known of a problem before work goes into it, each thing by a test that says what to do.
+
+The goal, controllability there, convexity in the controls, the step of integration, smoothness and symmetries are
+looked at; then a few initial states are solved by DDP from several starts, and two of them again by NMPC.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from nocl.data import Solution
+from nocl.judge import simulate
+from nocl.ocp import OCP
+from nocl.scales import usual_sizes
+from nocl.solvers.ddp.global_search import solve_globally
+from nocl.solvers.ddp.solver import DDP
+from nocl.solvers.grid import fastest_at_start
+from nocl.solvers.mirrors import mirrors
+from nocl.solvers.nmpc.solver import NMPC
+from nocl.support import checks
+from nocl.support.checks import Array
+
+OK, REMARK, PROBLEM = "ok", "remark", "PROBLEM"
+STILL = 1e-6  # of usual sizes, what a state may drift by over the horizon at a goal that is an equilibrium
+RANK = 1e-8  # relative singular values below which a mode is not controlled
+UNSTABLE = 1e-6  # modes times the horizon that grow faster need a control
+STATES, STARTS = 8, 4  # that are solved
+CHECKED = 2  # of them by NMPC, too
+AGREE = 1e-3  # of the cost: methods that differ by more disagree
+SMALL = 1e-3  # of a usual cost: costs are not divided by less
+NEAR = 0.05  # of the cost: other optima that are so near make a switching surface
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What one test says."""
+
+    about: str
+    verdict: str  # OK, REMARK or PROBLEM
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.about:>16}  {self.verdict:8}{self.text}"
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """All findings; str() of it has a line for each."""
+
+    findings: tuple[Finding, ...]
+    seconds: float
+
+    @property
+    def ok(self) -> bool:
+        """Whether no test found a problem."""
+        return all(finding.verdict != PROBLEM for finding in self.findings)
+
+    def __str__(self) -> str:
+        return "\n".join([*map(str, self.findings), f"{self.seconds:.0f} s"])
+
+
+def doctor(ocp: OCP, intervals: int = 80, seed: int = 0) -> Diagnosis:
+    """Examine a problem, in about half a minute for up to six states.
+
+    intervals : of plans; seed : of the initial states and starts. Where the dynamics are not known (xdot=None) the
+    tests that need them are left out, and said so.
+    """
+    checks.problem(ocp, "doctor")
+    checks.whole(intervals, "intervals", "doctor", 2)
+    checks.whole(seed, "seed", "doctor", most=2**62)
+    begin = time.perf_counter()
+    if ocp.system.xdot is None:
+        found = [Finding("dynamics", REMARK, "not known (xdot=None): nothing else can be tested before a log has "
+                         "taught them, nocl identify --data")]
+    else:
+        found = [*_definition(ocp), *_solutions(ocp, intervals, seed)]
+    return Diagnosis(tuple(found), time.perf_counter() - begin)
+
+
+# The definition
+
+
+def _definition(ocp: OCP) -> Iterator[Finding]:
+    yield _goal(ocp)
+    yield _control(ocp)
+    yield _convexity(ocp)
+    if ocp.kinks:
+        yield Finding("smoothness", REMARK, ocp.not_smooth)
+    found = mirrors(ocp)
+    yield Finding("symmetries", OK, f"{len(found)} mirror image(s): solutions of one side serve the other" if found
+                  else "none")
+
+
+def _at_goal(ocp: OCP) -> dict[str, Array]:
+    """x, u, t, p at the goal, parameters at their nominal values."""
+    p = ocp.nominal[None]
+    x, u = (np.asarray(z) for z in ocp.goals(p))
+    return {"x": x, "u": u, "t": np.zeros(1), "p": p}
+
+
+def _goal(ocp: OCP) -> Finding:
+    rate = ocp.functions.f(*ocp.functions.arguments.columns(**_at_goal(ocp))).full()[:, 0]
+    share = np.abs(rate) * ocp.longest / usual_sizes(ocp).x
+    i = int(share.argmax())
+    if share[i] <= STILL:
+        return Finding("goal", OK, "the goal pair is an equilibrium")
+    s = ocp.system
+    return Finding("goal", REMARK, f"no equilibrium: d {s.unit(s.state_names[i])} / dt is {rate[i]:.3g} there, so that "
+                   "what arrives does not stay: fine if the end alone counts, else choose u_goal so that f(x_goal, "
+                   "u_goal) = 0")
+
+
+def _control(ocp: OCP) -> Finding:
+    """The modes at the goal that grow, and no control reaches (Popov, Belevitch and Hautus)."""
+    of, at = usual_sizes(ocp), _at_goal(ocp)
+    A, B = (j.full() for j in ocp.functions.jacobian(*ocp.functions.arguments.columns(**at))[:2])
+    A, B = A * of.x / of.x[:, None], B * of.u / of.x[:, None]
+    size, n = max(np.abs(A).max(), np.abs(B).max(), 1e-300), len(A)
+    lost = []
+    for mode in np.linalg.eigvals(A):
+        U, sigma, _ = np.linalg.svd(np.c_[mode * np.eye(n) - A, B])
+        if mode.real * ocp.longest > -UNSTABLE and sigma[-1] < RANK * size:
+            lost.append(ocp.system.state_names[int(np.abs(U[:, -1]).argmax())])
+    if not lost:
+        return Finding("controllability", OK, "every mode at the goal that does not fall off by itself is controlled")
+    return Finding("controllability", REMARK, f"at the goal no control moves {', '.join(sorted(set(lost)))} "
+                   "(linearised): LQR does not exist there; a finite horizon may do without, or the controls there act "
+                   "by products only, as of a car that stands")
+
+
+def _convexity(ocp: OCP) -> Finding:
+    try:
+        ocp.check_strict("the default training and DDP refuse it")
+    except ValueError as error:
+        return Finding("convexity", PROBLEM, str(error))
+    return Finding("convexity", OK, "the cost curves in every control")
+
+
+# Solutions
+
+
+def _solutions(ocp: OCP, intervals: int, seed: int) -> Iterator[Finding]:
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        try:
+            ddp = DDP(ocp, intervals=intervals)
+            begin = time.perf_counter()
+            found = _solved(ddp, seed)
+        except ValueError as error:
+            yield Finding("solutions", PROBLEM, f"DDP does not take it: {error}")
+            return
+        took = time.perf_counter() - begin
+    yield _grid(ddp, said)
+    yield _success(ddp, found, took)
+    if found.success.any():
+        yield _inside(ocp, found[found.success])
+        yield _rivals(found[found.success])
+        yield _second(ocp, found[found.success])
+
+
+def _solved(ddp: DDP, seed: int) -> Solution:
+    x0, p = ddp.ocp.initial_states.sample(STATES, seed), ddp.ocp.sample_parameters(STATES, seed)
+    return solve_globally(ddp, x0, p=p if ddp.ocp.np else None, starts=STARTS, rounds=1, seed=seed, progress=False)
+
+
+def _grid(ddp: DDP, said: list[warnings.WarningMessage]) -> Finding:
+    step, fastest = ddp.ocp.longest / ddp.intervals, fastest_at_start(ddp.ocp, ddp.ocp.functions)
+    text = (f"{ddp.substeps} Runge-Kutta step(s) in each of {ddp.intervals} intervals of {step:.3g}; the fastest time "
+            f"constant where it starts is {fastest:.3g}")
+    coarse = [str(w.message) for w in said if "too coarse" in str(w.message)]
+    if ddp.coarse:
+        return Finding("integration", PROBLEM, coarse[-1] if coarse else text)
+    return Finding("integration", REMARK if ddp.substeps > 1 else OK, text)
+
+
+def _success(ddp: DDP, found: Solution, took: float) -> Finding:
+    n, solved = len(found), int(found.success.sum())
+    text = f"{solved} of {n} initial states by DDP, {STARTS} starts each, {took:.1f} s"
+    if solved == n:
+        return Finding("solutions", OK, text)
+    why = Counter(found.message[~found.success].tolist()).most_common(1)[0][0]
+    return Finding("solutions", REMARK if solved > n // 2 else PROBLEM,
+                   f"{text}; of the others, most often: {why}. A longer horizon or wider bounds where something cannot "
+                   "be reached or held; more intervals where it is stiff")
+
+
+def _inside(ocp: OCP, found: Solution) -> Finding:
+    """Whether plans stay in X, where learned dynamics are trained."""
+    s = ocp.system
+    over = np.maximum(found.x - s.ubx, s.lbx - found.x).max(axis=(0, 1))
+    out = np.flatnonzero(over > STILL * (s.ubx - s.lbx))
+    if not out.size:
+        return Finding("box X", OK, "plans stay in it")
+    names = ", ".join(f"{s.state_names[i]} by {over[i]:.3g}" for i in out)
+    return Finding("box X", REMARK, f"plans leave it: {names}. Dynamics are learned inside it, and it holds nothing: "
+                   "widen lbx and ubx, or bound the trajectory by state_bounds")
+
+
+def _rivals(found: Solution) -> Finding:
+    """States with another local optimum that costs nearly the same."""
+    close = sum(bool(((costs[1:, 0] - costs[0, 0]) <= NEAR * abs(costs[0, 0])).any()) for costs in found.optima
+                if len(costs))
+    text = f"{close} of {len(found)} states have another optimum within {100 * NEAR:g} % of the best"
+    if not close:
+        return Finding("rival optima", OK, text)
+    return Finding("rival optima", REMARK, f"{text}: somewhere between, the best way switches, and one smooth "
+                   "controller loses there; TrainSettings(branches=2) chooses between two answers")
+
+
+def _second(ocp: OCP, found: Solution) -> Finding:
+    """NMPC from starts of its own, on a few states; both plans as the judge sees them, whose steps are as fine as it
+    takes.
+    """
+    some = found[np.arange(min(CHECKED, len(found)))]
+    x0, p, about = some.x[:, 0], some.p if ocp.np else None, "second opinion"
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        own = NMPC(ocp, some.u.shape[1], passes=0, starts=STARTS, between=bool(ocp.constraint_names)).solve(
+            x0, p=p, workers=1, progress=False)
+        costs = [_judged(ocp, s, p) for s in (some, own)]
+    if not np.isfinite(costs[1]).any():
+        return Finding(about, REMARK, f"NMPC solves none of {len(some)} states: {own.message[0]}")
+    if not np.isfinite(costs[0]).all():
+        return Finding(about, REMARK, "on the exact dynamics a plan of DDP does not hold all constraints, or blows up: "
+                       "more intervals")
+    off = (costs[1] - costs[0]) / np.maximum(np.abs(costs[0]), SMALL * usual_sizes(ocp).cost)
+    i = int(off.argmin())
+    if off[i] < -AGREE:
+        return Finding(about, REMARK, f"NMPC is {-100 * off[i]:.2g} % better than DDP from state {i}: there are better "
+                       "optima than a few starts find: give training more seeds and starts")
+    solved = int(np.isfinite(costs[1]).sum())
+    return Finding(about, OK, f"NMPC, from starts of its own, finds nothing better on {solved} state(s)")
+
+
+def _judged(ocp: OCP, s: Solution, p: Array | None) -> Array:
+    """[B], the cost of plans on the exact dynamics, inf where they fail; of free horizons the plans' own."""
+    if ocp.is_free:
+        return s.cost
+    run = simulate(ocp, np.nan_to_num(s.u), s.x[:, 0], p=p)
+    return np.where(run.success & s.success, run.cost, np.inf)
