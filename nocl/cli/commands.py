@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from nocl import __version__
 from nocl.cli import arguments, reproduce
+from nocl.comparisons.diagnosis import doctor
 from nocl.solvers import registry
 from nocl.support.fields import EFFORTS
 from nocl.support.lock import alone
@@ -203,8 +204,6 @@ def _problem(args: argparse.Namespace) -> tuple[OCP, Path]:
 
 
 def _doctor(args: argparse.Namespace) -> None:
-    from nocl.comparisons.diagnosis import doctor
-
     ocp = load_ocp(args.problem)
     found = doctor(ocp if args.p is None else ocp.at(args.p), args.intervals, args.seed)
     print(found)
