@@ -117,26 +117,27 @@ def _goal(ocp: OCP) -> Finding:
 
 
 def _control(ocp: OCP) -> Finding:
-    """The modes at the goal that grow, and no control reaches (Popov, Belevitch and Hautus)."""
+    """The modes at the goal that grow, and no control reaches (Popov, Belevitch and Hautus), each row in its own size.
+    """
     of, at = usual_sizes(ocp), _at_goal(ocp)
     A, B = (j.full() for j in ocp.functions.jacobian(*ocp.functions.arguments.columns(**at))[:2])
-    A, B = A * of.x / of.x[:, None], B * of.u / of.x[:, None]
-    size, n = max(np.abs(A).max(), np.abs(B).max(), 1e-300), len(A)
-    lost = []
+    A, B, n = ocp.longest * A * of.x / of.x[:, None], ocp.longest * B * of.u / of.x[:, None], len(A)
+    floor, lost = RANK**2 * max(np.abs(A).max(), np.abs(B).max(), 1e-300), []
     for mode in np.linalg.eigvals(A):
-        U, sigma, _ = np.linalg.svd(np.c_[mode * np.eye(n) - A, B])
-        if mode.real * ocp.longest > -UNSTABLE and sigma[-1] < RANK * size:
+        rows = np.c_[mode * np.eye(n) - A, B]
+        U, sigma, _ = np.linalg.svd(rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), floor))
+        if mode.real > -UNSTABLE and sigma[-1] < RANK:
             lost.append(ocp.system.state_names[int(np.abs(U[:, -1]).argmax())])
     if not lost:
         return Finding("controllability", OK, "every mode at the goal that does not fall off by itself is controlled")
     return Finding("controllability", REMARK, f"at the goal no control moves {', '.join(sorted(set(lost)))} "
-                   "(linearised): LQR does not exist there; a finite horizon may do without, or the controls there act "
-                   "by products only, as of a car that stands")
+                   "(linearised): LQR on an infinite horizon does not exist; a finite one may do without, or the "
+                   "controls there act by products only, as of a car that stands")
 
 
 def _convexity(ocp: OCP) -> Finding:
     try:
-        ocp.check_strict("the default training and DDP refuse it")
+        ocp.check_strict("the default training refuses it, DDP may not converge")
     except ValueError as error:
         return Finding("convexity", PROBLEM, str(error))
     return Finding("convexity", OK, "the cost curves in every control")
@@ -149,7 +150,7 @@ def _solutions(ocp: OCP, intervals: int, seed: int) -> Iterator[Finding]:
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
         try:
-            ddp = DDP(ocp, intervals=intervals)
+            ddp = DDP(ocp, intervals=intervals).as_best_known()
             begin = time.perf_counter()
             found = _solved(ddp, seed)
         except ValueError as error:
@@ -223,24 +224,24 @@ def _second(ocp: OCP, found: Solution) -> Finding:
         warnings.simplefilter("ignore")
         own = NMPC(ocp, some.u.shape[1], passes=0, starts=STARTS, between=bool(ocp.constraint_names)).solve(
             x0, p=p, workers=1, progress=False)
-        costs = [_judged(ocp, s, p) for s in (some, own)]
-    if not np.isfinite(costs[1]).any():
+        ours, theirs = (_judged(ocp, s, x0, p) for s in (some, own))
+    if not own.success.any():
         return Finding(about, REMARK, f"NMPC solves none of {len(some)} states: {own.message[0]}")
-    if not np.isfinite(costs[0]).all():
-        return Finding(about, REMARK, "on the exact dynamics a plan of DDP does not hold all constraints, or blows up: "
-                       "more intervals")
-    off = (costs[1] - costs[0]) / np.maximum(np.abs(costs[0]), SMALL * usual_sizes(ocp).cost)
+    if not (np.isfinite(ours).all() and np.isfinite(theirs[own.success]).all()):
+        return Finding(about, REMARK, "on the exact dynamics a plan does not hold all constraints, or blows up: more "
+                       "intervals")
+    off = (theirs - ours) / np.maximum(np.abs(ours), SMALL * usual_sizes(ocp).cost)
     i = int(off.argmin())
     if off[i] < -AGREE:
         return Finding(about, REMARK, f"NMPC is {-100 * off[i]:.2g} % better than DDP from state {i}: there are better "
                        "optima than a few starts find: give training more seeds and starts")
-    solved = int(np.isfinite(costs[1]).sum())
+    solved = int(own.success.sum())
     return Finding(about, OK, f"NMPC, from starts of its own, finds nothing better on {solved} state(s)")
 
 
-def _judged(ocp: OCP, s: Solution, p: Array | None) -> Array:
-    """[B], the cost of plans on the exact dynamics, inf where they fail; of free horizons the plans' own."""
+def _judged(ocp: OCP, s: Solution, x0: Array, p: Array | None) -> Array:
+    """[B], the cost of plans from x0 on the exact dynamics, inf where they fail; of free horizons the plans' own."""
     if ocp.is_free:
         return s.cost
-    run = simulate(ocp, np.nan_to_num(s.u), s.x[:, 0], p=p)
+    run = simulate(ocp, np.nan_to_num(s.u), x0, p=p)
     return np.where(run.success & s.success, run.cost, np.inf)

@@ -34,7 +34,8 @@ def promises(report: Report, within: float = WITHIN, confidence: float = CONFIDE
     solver says, are none of those meant.
 
     A state counts where the run violates nothing and costs at most `within` per cent more than the best known cost,
-    over all methods here: it is a statement about that cost, not about an optimum that nobody found.
+    over all methods here and simple baselines: it is a statement about that cost, not about an optimum that nobody
+    found.
     """
     n = int(report.counted.sum())
     if report.settings.get("seed") is None or not n:

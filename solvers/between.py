@@ -1,8 +1,11 @@
 """What constraints dip by between the nodes of a plan: the margins that make up for it there.
 
-An interval's dip is how far a row's least value inside it, the control held, lies below the lesser of its ends. A
-node's margin is the larger dip of the two intervals beside it. Plans that are solved again with these margins hold the
-constraints between nodes to second order in what the margins changed: two exchanges are worth it, a third is not.
+An interval's dip is how far a row's least value inside it, the control held, lies below the lesser of its ends, or for
+a row of the control below its start, since another control acts from the end on. A node's margin is the larger dip of
+the two intervals beside it, or that of the interval that its control acts on. Plans that are solved again with these
+margins hold the constraints between nodes to second order in what the margins changed: two exchanges are worth it, more
+only while constraints are violated by more than is tolerated. A row of state and control that its node's control does
+not move, a power at rest, has no margin that helps: such plans are told.
 """
 
 from __future__ import annotations
@@ -11,39 +14,55 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from nocl.constraints import TOLERANCE
 from nocl.functions import Functions
 from nocl.support.checks import Array
 
 INSIDE = 8  # parts of an interval, at whose ends rows are looked at
-EXCHANGES = 2
+EXCHANGES, MOST = 2, 6  # of margins, and where more are needed at most
+SAME = 0.01  # of what is left: an exchange that changes it by less is the last
 CUTS = "; between nodes it may cut corners, margins there could not be held"  # what is said of a plan
 
 
 class Dips:
-    """Those of the rows c [n] >= 0, in units of their scales, in a problem's own symbols; equations have none."""
+    """Those of the rows c [n] >= 0, in units of their scales, in a problem's own symbols; `without` [n] have none.
 
-    def __init__(self, functions: Functions, c: ca.SX, equal: NDArray[np.bool_]) -> None:
-        self.at, self.step, self.equal = functions.arguments, functions.step(), equal
-        self.c = self.at.function("c", {"c": c})
+    substeps : of an interval, in the plans
+    """
+
+    def __init__(self, functions: Functions, c: ca.SX, without: NDArray[np.bool_], substeps: int) -> None:
+        self.at, self.without = functions.arguments, without
+        self.step, self.c = functions.step(substeps=-(-substeps // INSIDE)), self.at.function("c", {"c": c})
+        self.of_u = np.isin(np.arange(len(without)), ca.jacobian_sparsity(c, self.at["u"]).get_triplet()[0])
 
     def margins(self, t: Array, x: Array, u: Array, p: Array) -> Array:
         """[B, K+1, n], of each node, for t [B, K+1], x [B, K+1, nx], u [B, K, nu] and p [B, np]."""
+        (B, K, _), n = u.shape, len(self.without)
         values = self._values(t, x, u, p)
-        ends, (B, K, _) = np.minimum(values[0], values[-1]), u.shape
-        dip = np.maximum(ends - np.min(values, axis=0), 0.0).reshape(B, K, len(self.equal))
-        nothing = np.zeros((B, 1, len(self.equal)))
-        larger = np.maximum(np.concatenate([nothing, dip], axis=1), np.concatenate([dip, nothing], axis=1))
-        return np.where(self.equal, 0.0, larger)
+        top = np.where(self.of_u, values[0], np.minimum(values[0], values[-1]))
+        dip = np.nan_to_num(np.maximum(top - values.min(axis=0), 0.0), posinf=0.0).reshape(B, K, n)
+        nothing = np.zeros((B, 1, n))
+        after, before = np.concatenate([dip, nothing], axis=1), np.concatenate([nothing, dip], axis=1)
+        return np.where(self.without, 0.0, np.where(self.of_u, after, np.maximum(after, before)))
+
+    def cut(self, t: Array, x: Array, u: Array, p: Array) -> NDArray[np.bool_]:
+        """[B], whether a plan violates one of the rows by more than TOLERANCE, at nodes or between them."""
+        return np.asarray(~(self.left(t, x, u, p) <= TOLERANCE))
 
     def left(self, t: Array, x: Array, u: Array, p: Array) -> Array:
-        """[B], by how much of its scale a plan violates the worst inequality, between nodes too."""
-        least = np.where(self.equal, 0.0, np.min(self._values(t, x, u, p), axis=0))
-        over: Array = np.maximum(-least, 0.0).reshape(len(u), -1).max(axis=1, initial=0.0)
+        """[B], by how much of its scale a plan violates the worst row, between nodes too; what x0 alone decides does
+        not count."""
+        values = self._values(t, x, u, p).reshape(INSIDE + 1, *u.shape[:2], len(self.without))
+        values[0, :, 0][:, ~self.of_u] = 0.0
+        least = np.where(self.without, 0.0, values.min(axis=0))
+        over: Array = np.maximum(-least, 0.0).max(axis=(1, 2), initial=0.0)
         return over
 
-    def _values(self, t: Array, x: Array, u: Array, p: Array) -> list[Array]:
-        """The rows [B K, n] at the ends of all parts of intervals."""
+    def _values(self, t: Array, x: Array, u: Array, p: Array) -> Array:
+        """The rows [INSIDE + 1, B K, n] at the ends of all parts of intervals."""
         B, K, nu = u.shape
+        if not B * K:
+            return np.zeros((INSIDE + 1, 0, len(self.without)))
         part, now = np.diff(t).ravel() / INSIDE, t[:, :-1].ravel()
         states, controls, data = x[:, :-1].reshape(B * K, x.shape[2]), u.reshape(B * K, nu), np.repeat(p, K, axis=0)
         values = []
@@ -52,7 +71,7 @@ class Dips:
             values.append(_at_once(self.c, here))
             if j < INSIDE:
                 states = _at_once(self.step, [*here, part[None]])
-        return values
+        return np.array(values)
 
 
 def _at_once(function: ca.Function, columns: list[Array]) -> Array:

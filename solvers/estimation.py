@@ -26,6 +26,7 @@ NOISE = 1e-3  # of half the width of X: what a measured state is off by, unless 
 OUTLIER = 5.0  # standard deviations of an innovation, from where on it counts less: a kick is no change of mass
 STEPS = 8  # of Gauss-Newton for a measurement, at most
 ENOUGH = 0.01  # standard deviations: a step that is less is the last
+LOST = 1e6  # units of noise: what a prediction that is not finite is off by
 SHORTER = 0.25  # times a step that did not help
 SAME_TIME = 1e-6  # of an interval
 
@@ -134,26 +135,27 @@ class ParameterEstimator:
         return np.asarray((p - self.nominal) / self._width)
 
     def _fitted(self, z: Array, P: Array, seen: Seen, mean: Array, information: Array) -> tuple[Array, Array]:
-        """(z, its covariance) of least squares, from z and P [B, np, np] of the estimate before."""
+        """(z, its covariance) of least squares in the box, from z and P [B, np, np] of the estimate before."""
+        box = self._in_box(self.low), self._in_box(self.high)
         e, H = self._residuals(z, seen)
         w = _weights(e, H, P)
-        step, P = _newton(z, e, H, w, mean, information)
+        step, P = _newton(z, e, H, w, mean, information, box)
         for _ in range(STEPS):
             if (np.abs(step) <= ENOUGH * np.sqrt(np.einsum("bii->bi", P))).all():
                 break
-            trial = np.clip(z + step, self._in_box(self.low), self._in_box(self.high))
+            trial = np.clip(z + step, *box)
             there, slopes = self._residuals(trial, seen)
             less = _misfit(trial, there, w, mean, information) <= _misfit(z, e, w, mean, information)
             z, e = np.where(less[:, None], trial, z), np.where(less[:, None], there, e)
             H = np.where(less[:, None, None], slopes, H)
             w = np.where(less, _weights(e, H, P), w)
-            onward, P = _newton(z, e, H, w, mean, information)
+            onward, P = _newton(z, e, H, w, mean, information, box)
             step = np.where(less[:, None], onward, SHORTER * step)
-        return np.clip(z + step, self._in_box(self.low), self._in_box(self.high)), P
+        return z, P
 
     def _residuals(self, z: Array, seen: Seen) -> tuple[Array, Array]:
-        """What predictions are off by [m, B, nx], in units of noise, and their slopes in z [m, B, nx, np]; 0 where they
-        are not finite."""
+        """What predictions are off by [m, B, nx], in units of noise, and their slopes in z [m, B, nx, np]; 0 where the
+        measurement is not finite, and LOST where the prediction alone is not."""
         (m, B, nx), q = seen.x.shape, self.ocp.system.np
         columns = [np.reshape(v, (m * B, v.shape[2])).T for v in (seen.x, seen.u)]
         p = np.tile(self.nominal + self.half * z, (m, 1)).T
@@ -161,7 +163,9 @@ class ParameterEstimator:
         expected, H = predicted[:nx].T.reshape(m, B, nx), predicted[nx:].T.reshape(m, B, q, nx).swapaxes(2, 3)
         e, H = (seen.after - expected) / self.noise, H / self.noise[:, None] * self.half
         fine = np.isfinite(e).all(axis=2) & np.isfinite(H).all(axis=(2, 3))
-        return np.where(fine[..., None], e, 0.0), np.where(fine[..., None, None], H, 0.0)
+        known = np.isfinite(np.concatenate([seen.x, seen.u, seen.after], axis=2)).all(axis=2)
+        off = np.where(known, LOST, 0.0)[..., None]
+        return np.where(fine[..., None], e, off), np.where(fine[..., None, None], H, 0.0)
 
     def _folded(self, seen: Seen, z: Array, P: Array, mean: Array, information: Array) -> tuple[Array, Array]:
         """(mean, information) of what is known, with what measurements say to first order about z."""
@@ -180,11 +184,23 @@ def _weights(e: Array, H: Array, P: Array) -> Array:
     return np.asarray(1 / np.maximum(size / OUTLIER**2, 1.0))
 
 
-def _newton(z: Array, e: Array, H: Array, w: Array, mean: Array, information: Array) -> tuple[Array, Array]:
-    """(the step [B, np] of Gauss-Newton, the covariance there [B, np, np])."""
+def _newton(z: Array, e: Array, H: Array, w: Array, mean: Array, information: Array,
+            box: tuple[Array, Array]) -> tuple[Array, Array]:
+    """(the step [B, np] of Gauss-Newton in the box, the covariance there [B, np, np] without it).
+
+    What stands at a bound and would go beyond is held, and the others are solved for again, until none is.
+    """
     A = information + np.einsum("mb,mbip,mbiq->bpq", w, H, H)
     slope = np.einsum("bpq,bq->bp", information, mean - z) + np.einsum("mb,mbip,mbi->bp", w, H, e)
-    return _solved(A, slope), np.linalg.inv(A)
+    held, q = np.zeros(z.shape, dtype=bool), z.shape[1]
+    for _ in range(q + 1):
+        free = (~held[:, :, None] & ~held[:, None]) * A + held[:, :, None] * np.eye(q)
+        step = _solved(free, np.where(held, 0.0, slope))
+        beyond = ((z <= box[0]) & (step < 0)) | ((z >= box[1]) & (step > 0))
+        if not beyond.any():
+            break
+        held |= beyond
+    return step, np.linalg.inv(A)
 
 
 def _misfit(z: Array, e: Array, w: Array, mean: Array, information: Array) -> Array:

@@ -108,9 +108,10 @@ class Search:
         self.stages += 1
         self.rng = np.random.default_rng([self.seed, self.stages])
         self.solver.begin(self.stages, what)
-        former = self.best.cost.copy()
+        former, rank = self.best.cost.copy(), self.best.rank
         run(*args)
-        self.improving = bool(_improved(former, self.best.cost, self.unit).any())
+        now, cost = self.best.rank, self.best.cost
+        self.improving = bool(((now < rank) | (now == rank) & _improved(former, cost, self.unit)).any())
 
     def improve(self, starts: int) -> None:
         """Rounds until one improves nothing; fresh cold starts are numbered from `starts` on."""
@@ -213,7 +214,8 @@ class Search:
     def _take(self, found: Found) -> None:
         """Count all that was tried, and keep what is better."""
         for rows, s in found:
-            tried = s.cost[:, None] if s.tried is None else s.tried
+            own = s.cost if s.cut is None else np.where(s.cut, np.inf, s.cost)  # what cuts corners is no such optimum
+            tried = own[:, None] if s.tried is None else s.tried
             known = ~np.isnan(tried)
             self.owners.append(np.repeat(rows, known.sum(axis=1)))
             self.costs.append(tried[known])

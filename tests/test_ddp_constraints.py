@@ -219,6 +219,61 @@ def test_margins_hold_constraints_between_nodes():
     assert (held.cost < 1.05 * plain.cost).all()
 
 
+def car(**changed) -> nocl.OCP:
+    """A cart to rest in 2 s, its drive of little power: a row of state and control."""
+    pos, v, force = (ca.SX.sym(name) for name in ("pos", "v", "force"))
+    system = nocl.System("car", x=ca.vertcat(pos, v), u=force, xdot=ca.vertcat(v, force), lbu=[-3], ubu=[3],
+                         lbx=[-5, -5], ubx=[5, 5])
+    good = {"horizon": 2.0, "running": 0.1 * force**2 + pos**2, "terminal": pos**2 + v**2, "x_goal": [0, 0],
+            "u_goal": [0], "initial_states": nocl.Uniform([0.9, -0.1], [1.1, 0.1]),
+            "constraints": {"power": (-0.5, force * v, 0.5)}}
+    return nocl.OCP(system, **{**good, **changed})
+
+
+def test_margins_hold_rows_of_the_control_whose_end_no_node_bounds():
+    """Within an interval force * v moves on while the force is held; at the next node another force acts."""
+    ocp, x0 = car(), [[1.0, -0.5], [0.9, -0.4]]
+    plain, held = (DDP(ocp, intervals=40, substeps=1, threads=1, between=between).solve(x0)
+                   for between in (False, True))
+    by_nmpc = NMPC(ocp, 40, substeps=1, starts=2, passes=0, between=True).solve(x0, workers=1, progress=False)
+    assert not nocl.simulate(ocp, plain.u, x0).success.any()
+    for s in (held, by_nmpc):
+        assert s.success.all()
+        assert not s.cut.any()
+        assert nocl.simulate(ocp, s.u, x0).violation.max() < 1e-3
+    np.testing.assert_allclose(by_nmpc.cost, held.cost, rtol=1e-6)
+    at_rest = DDP(ocp, intervals=20, substeps=1, threads=1, between=True).solve([[1.0, 0.0]])
+    assert at_rest.cut.tolist() == [True]  # force * 0 at the first node, whatever the force
+    assert "it may cut corners" in at_rest.message[0]
+
+
+def test_dips_see_what_the_plans_steps_see():
+    """A servo whose position swings about 50 times a second, with a bound on it, on 20 intervals of 32 substeps."""
+    q, v, u = (ca.SX.sym(name) for name in ("q", "v", "u"))
+    system = nocl.System("servo", x=ca.vertcat(q, v), u=u, xdot=ca.vertcat(v, 300**2 * (u - q) - 300 * v), lbu=[-2],
+                         ubu=[2], lbx=[-2, -400], ubx=[2, 400])
+    ocp = nocl.OCP(system, horizon=1.0, running=(q - 1)**2 + 0.01 * u**2, terminal=0.0, x_goal=[0, 0], u_goal=[0],
+                   initial_states=nocl.Uniform([-0.1, 0], [0.1, 0]), state_bounds={"q": (None, 0.8)})
+    found = DDP(ocp, intervals=20, substeps=32, threads=1, between=True).solve([[0.0, 0.0]])
+    assert found.cut.tolist() == [False]
+    assert nocl.simulate(ocp, found.u, [0.0, 0.0]).violation[0] < 0.01
+
+
+def test_known_solutions_that_cut_corners_are_seen_as_such():
+    of = problem("point")
+    x0 = [[-2.5, 0.2, 0.0, 0.0], [-2.2, -0.1, 0.1, 0.0]]
+    plain = solver(of, 20).solve(x0)
+    found = solve_globally(solver(of, 20), x0, starts=1, rounds=1, known=plain)
+    assert found.cut.tolist() == [False, False]
+    assert deepest(of, found) < 0.02 * deepest(of, plain)
+    assert (found.cost > plain.cost).all()
+    assert (found.cost <= np.nanmin(np.where(np.isfinite(found.tried), found.tried, np.nan), axis=1) + 1e-12).all()
+
+
+def test_no_problem_at_all_is_no_problem():
+    assert len(DDP(car(), intervals=20, between=True).solve(np.zeros((0, 2)))) == 0
+
+
 def test_a_global_search_holds_them_between_nodes_unless_told_otherwise():
     of = problem("point")
     x0 = [[-2.5, 0.2, 0.0, 0.0], [-2.2, -0.1, 0.1, 0.0]]

@@ -7,6 +7,7 @@ import pytest
 import nocl
 from nocl.cli import main
 from nocl.comparisons.diagnosis import OK, PROBLEM, REMARK, doctor
+from nocl.solvers import NMPC
 
 X, V, U = ca.SX.sym("pos"), ca.SX.sym("v"), ca.SX.sym("force")
 
@@ -87,6 +88,37 @@ def test_a_constraint_that_nothing_holds():
     assert by["solutions"].verdict == PROBLEM
     assert "0 of 8" in by["solutions"].text
     assert "'far'" in by["solutions"].text or "'still'" in by["solutions"].text
+
+
+def test_an_opinion_that_is_not_there(monkeypatch):
+    solve = NMPC.solve
+
+    def second_fails(self, *args, **options):
+        s = solve(self, *args, **options)
+        s.x[1], s.u[1], s.cost[1], s.success[1] = np.nan, np.nan, np.inf, False
+        return s
+
+    monkeypatch.setattr(NMPC, "solve", second_fails)
+    assert "nothing better on 1 state(s)" in said(cart())[1]["second opinion"].text
+
+    def all_fail(self, *args, **options):
+        s = solve(self, *args, **options)
+        s.x[:], s.u[:], s.cost[:], s.success[:], s.message[:] = np.nan, np.nan, np.inf, False, "given up"
+        return s
+
+    monkeypatch.setattr(NMPC, "solve", all_fail)
+    assert "NMPC solves none of 2 states: given" in said(cart())[1]["second opinion"].text
+
+
+def test_time_scales_that_are_far_apart_are_no_lack_of_control():
+    _, by = said(cart((1e-4 * V, 1e5 * (U - V)), horizon=1e4, running=1e-5 * U**2), intervals=10)
+    assert by["controllability"].verdict == OK
+
+
+def test_a_coarse_grid_is_seen_where_constraints_are_held():
+    _, by = said(cart((V, 600 * (U - V)), terminal=X**2, state_bounds={"v": (-0.9, 0.9)}))
+    assert by["integration"].verdict == PROBLEM
+    assert "too coarse" in by["integration"].text
 
 
 def test_a_stiff_plant_and_a_switch():

@@ -4,6 +4,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.optimize import least_squares
 
 import nocl
 from nocl.solvers.estimation import Adaptive, ParameterEstimator
@@ -88,6 +89,25 @@ def test_it_is_not_sure_of_wrong_values_where_p_acts_nonlinearly():
         known = filter_.update(known, x[k], u[k], after, k * DT)
         assert (np.abs(known.p - p) < 4.5 * known.std + 1e-12).all()
     assert (known.std < 0.05 * filter_.half).all()
+
+
+def test_at_the_edge_of_the_box_it_is_bounded_least_squares():
+    """Friction 0, the lower bound: what it would be beyond is not taken off the mass."""
+    ocp, noise = cart(), np.array([2e-4, 2e-3])
+    p = np.tile([0.9, 0.0], (12, 1))
+    x, u = record(ocp, p, 15)
+    noisy = x + noise * np.random.default_rng(2).standard_normal(x.shape)
+    filter_ = ParameterEstimator(ocp, DT, noise=noise)
+    found = run(filter_, noisy, u)
+    step = ocp.functions.step(substeps=4)
+    for b in range(12):
+        def off(q: np.ndarray, b: int = b) -> np.ndarray:
+            given = np.tile(np.r_[q, 0.0][:, None], (1, 15))
+            after = step(noisy[:-1, b].T, u[:, b].T, given, DT)[0].full().T
+            return np.r_[((noisy[1:, b] - after) / noise).ravel(), (q - ocp.nominal[:2]) / filter_.half]
+        best = least_squares(off, [1.0, 0.2], bounds=(filter_.low, filter_.high), xtol=1e-12, ftol=1e-12).x
+        assert (np.abs(found.p[b] - best) < 0.02 * found.std[b]).all()
+    assert (found.p[:, 1] == 0).sum() >= 3
 
 
 def test_units_of_states_change_nothing():

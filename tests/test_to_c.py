@@ -191,3 +191,10 @@ def test_it_compiles_for_a_microcontroller(tmp_path, dtype):
 def test_networks_of_any_shape_pass(tmp_path_factory, activation, width):
     folder = to_c(policy(activation, width), tmp_path_factory.mktemp("c"), bounds=BOUNDS)
     assert ": ok" in run("make", "check", cwd=folder)
+
+
+def test_a_slope_that_is_infinite_leaves_a_self_test_that_runs(tmp_path):
+    """sqrt at 0, a corner of the box: its slope says nothing of how large errors may be."""
+    x = ca.SX.sym("x")
+    folder = to_c(ca.Function("root", [x], [ca.sqrt(x)], ["x"], ["y"]), tmp_path / "c", "root", bounds={"x": (0, 1)})
+    assert ": ok" in run("make", "check", cwd=folder)

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 from nocl import __version__
 from nocl.cli import arguments, reproduce
-from nocl.comparisons.diagnosis import doctor
 from nocl.solvers import registry
 from nocl.support.fields import EFFORTS
 from nocl.support.lock import alone
@@ -204,7 +203,7 @@ def _problem(args: argparse.Namespace) -> tuple[OCP, Path]:
 
 
 def _doctor(args: argparse.Namespace) -> None:
-    ocp = load_ocp(args.problem)
+    ocp, doctor = load_ocp(args.problem), import_module("nocl.comparisons.diagnosis").doctor
     found = doctor(ocp if args.p is None else ocp.at(args.p), args.intervals, args.seed)
     print(found)
     if not found.ok:

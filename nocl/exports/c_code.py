@@ -281,7 +281,8 @@ def _scales(function: ca.Function, inputs: Sequence[_Argument], z: Array, values
     v = ca.MX.sym("z", z.shape[1])
     y = ca.vertcat(*function.call(ca.vertsplit(v, [0, *np.cumsum([a.n for a in inputs]).tolist()])))
     size = ca.Function("size", [v], [ca.densify(ca.mtimes(ca.fabs(ca.jacobian(y, v)), np.abs(z).max(axis=0)))])
-    scale = np.fmax(np.abs(values).max(axis=0), size.map(len(z))(z.T).full().T)
+    sensitive = size.map(len(z))(z.T).full().T
+    scale = np.fmax(np.abs(values).max(axis=0), np.where(np.isfinite(sensitive), sensitive, 0.0))
     return np.where(scale > 0, scale, 1.0)
 
 

@@ -171,13 +171,18 @@ def findings(part: ExportPart, backend: str, dtype: str, z: Array, values: Rows,
              reference: Reference | None = None) -> list[Finding]:
     """A backend's largest errors in values, and in first derivatives where it has them."""
     (y, J, change), size = reference or reference_of(part, z), _sizes(z)
-    scale = np.maximum(np.abs(y).max(axis=0), np.abs(J) @ size)
+    scale = np.maximum(np.abs(y).max(axis=0), _finite(np.abs(J) @ size))
     found = [_finding(part, backend, dtype, "value", z, values(z) - y, scale)]
     if slopes is not None:
         J, off, bent = J * size, (slopes(z) - J) * size, change * size
-        scale = np.maximum(np.abs(J).max(axis=(0, 2), keepdims=True)[0].T, bent.max(axis=2))
+        scale = np.maximum(_finite(np.abs(J)).max(axis=(0, 2), keepdims=True)[0].T, _finite(bent.max(axis=2)))
         found.append(_finding(part, backend, dtype, "first derivatives", z, off, scale[..., None]))
     return found
+
+
+def _finite(size: Array) -> Array:
+    """A kink or a pole says nothing of how large errors may be."""
+    return np.where(np.isfinite(size), size, 0.0)
 
 
 def _sizes(z: Array) -> Array:

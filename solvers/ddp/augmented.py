@@ -63,7 +63,7 @@ class Augmented(Work):
         self.margin = None if d.margin is None else self.with_margin(np.zeros_like(self.y))
         self.parts, self.new_parts = np.zeros((B, 3)), np.zeros((B, 3))  # cost, sum rho e^2 / 2, max |e|
         self.last, self.stalls = np.full(B, np.inf), np.zeros(B, dtype=np.int64)
-        self.cut = np.zeros(B, dtype=bool)  # where margins could not be held
+        self.cut = np.zeros(B, dtype=bool)  # where constraints are left between nodes, which were to be held there
         super().__post_init__()
         self._first_penalty()
         if d.constraints == "hard":
@@ -107,8 +107,6 @@ class Augmented(Work):
         for name, value in kept.items():
             getattr(self, name)[back] = value[back]
         margin[back] = 0.0 if before is None else before[back]
-        self.cut[rows] = False
-        self.cut[back] = True
 
     def _held_in(self) -> list[Array | None]:
         return [self.y, self.margin, self.penalty]

@@ -65,7 +65,7 @@ def solve_globally(ddp: DDP, x0: ArrayLike, *, p: Any = None, starts: int = 16, 
     ValueError for wrong input; a state for which nothing converged has success False.
     """
     rows, ddp = checks.states(x0, ddp.ocp.system.nx, ddp.ocp.system.name)[0], ddp.as_best_known()
-    values = ddp.ocp.parameters_of(p, len(rows), "solve_globally")
+    values, known = ddp.ocp.parameters_of(p, len(rows), "solve_globally"), known and ddp.looked_at(known)
     if min(starts + (known is not None), neighbours + 1, rounds + 1) < 1:
         raise ValueError(f"starts is {starts}, neighbours {neighbours}, rounds {rounds}; expected starts >= 1 (0 where "
                          "solutions are known), the others >= 0")

@@ -27,14 +27,14 @@ from nocl.constraints import TOLERANCE
 from nocl.data import Solution
 from nocl.functions import Functions
 from nocl.ocp import OCP
-from nocl.solvers.between import EXCHANGES, Dips
+from nocl.solvers.between import EXCHANGES, MOST, SAME, Dips
 from nocl.solvers.ddp.augmented import Augmented
 from nocl.solvers.ddp.batch import Job, Piece, assembled, pieces
 from nocl.solvers.ddp.constraints import ConstraintRows, rows_of
 from nocl.solvers.ddp.free import FreeTime, lifted, with_horizons
 from nocl.solvers.ddp.kernel import ddp_source, pack_weights
 from nocl.solvers.ddp.without_compiler import ddp_kernel
-from nocl.solvers.ddp.work import GROWTH, DDPSettings, Work
+from nocl.solvers.ddp.work import CONVERGED, GROWTH, DDPSettings, Work
 from nocl.solvers.grid import fastest_at_start, firsts, followed, measured
 from nocl.solvers.starts import middle
 from nocl.substeps import COARSE, Grid, settled
@@ -216,14 +216,29 @@ class DDP:
 
     def _exchange(self, work: Augmented) -> None:
         """Hold constraints between nodes, by margins at them."""
-        stage, u = self.rows.stage, self.posed.functions.arguments["u"]
-        dips = Dips(_functions(self.posed, self.dynamics), stage.c, stage.equal)
-        t = work.t0[:, None] + work.h[:, None] * np.arange(self.intervals + 1)
-        for _ in range(EXCHANGES):
+        dips, u = self._dips, self.posed.functions.arguments["u"]
+        t, left = work.t0[:, None] + work.h[:, None] * np.arange(self.intervals + 1), np.full(len(work.x0), np.inf)
+        for number in range(MOST):
             margin = self.rows.margins(dips.margins(t, work.x, work.u, work.p), u)
             work.exchange(work.with_margin(margin))
-        if (rows := np.flatnonzero(work.cut)).size:
-            work.cut[rows] = dips.left(t[rows], work.x[rows], work.u[rows], work.p[rows]) > TOLERANCE
+            former, left = left, dips.left(t, work.x, work.u, work.p)
+            open_ = (work.state == CONVERGED) & ~(left <= TOLERANCE)
+            if number + 1 >= EXCHANGES and not (np.abs(left - former)[open_] > SAME * former[open_]).any():
+                break
+        work.cut[:] = open_
+
+    @property
+    def _dips(self) -> Dips:
+        stage = self.rows.stage
+        return Dips(_functions(self.posed, self.dynamics), stage.c, stage.equal, self.substeps)
+
+    def looked_at(self, known: Solution) -> Solution:
+        """Solutions of this problem on this grid, with `cut` where this solver holds constraints between nodes."""
+        if not self.between or known.cut is not None:
+            return known
+        T, free = known.t[:, -1], self.ocp.is_free
+        t, x = (known.t / T[:, None], with_horizons(known.x, T)) if free else (known.t, known.x)
+        return replace(known, cut=known.success & self._dips.cut(t, x, known.u, known.parameters))
 
     def rollout(self, x0: Array, p: Array | None = None, **guess: Array) -> Array:
         """The states [B, K+1, nx] from x0 [B, nx] at t0 = 0 under a guess of `solve`'s: where the descent begins.

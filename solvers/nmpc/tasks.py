@@ -12,7 +12,7 @@ import numpy as np
 from nocl.constraints import PATH, TOLERANCE
 from nocl.data import Solution
 from nocl.ocp import OCP
-from nocl.solvers.between import CUTS, EXCHANGES
+from nocl.solvers.between import CUTS, EXCHANGES, MOST, SAME
 from nocl.solvers.nmpc.guesses import Guess
 from nocl.solvers.nmpc.transcription import (
     FEASIBLE,
@@ -93,7 +93,8 @@ def attempt(program: Transcription, task: Task, guesses: Sequence[Guess]) -> Out
         answers = [_between(program, task, a) if a.success else a for a in answers]
     seconds = time.perf_counter() - begin
     good, bad = ([a for a in answers if bool(a.success) is ok] for ok in (True, False))
-    return Outcome(task.name, task.row, np.array([a.cost for a in answers]), seconds,
+    costs = np.array([np.inf if a.cut else a.cost for a in answers])
+    return Outcome(task.name, task.row, costs, seconds,
                    sum(a.iterations for a in answers), min(good, key=lambda a: (a.cut, a.cost), default=None),
                    min(bad, key=lambda a: a.rank, default=None))
 
@@ -147,24 +148,35 @@ def _third_opinion(program: Transcription, task: Task, answers: Sequence[Answer]
 
 def _between(program: Transcription, task: Task, answer: Answer) -> Answer:
     """The answer, solved again with the margins that it needs between nodes; as it was where they cannot be held."""
-    own, iterations = np.zeros((1, 0)) if task.p is None else task.p[None], answer.iterations
-    for _ in range(EXCHANGES):
-        t = task.t if answer.t is None else answer.t
-        plan = (t[None], answer.x[None], answer.u[None], own)
-        again = _inside(program, task, t, answer, program.dips.margins(*plan)[0])
+    iterations, left = answer.iterations, np.inf
+    for number in range(MOST):
+        again = _inside(program, task, answer)
         iterations += again.iterations
         if not again.success:
-            cut = bool(program.dips.left(*plan)[0] > TOLERANCE)
-            return replace(answer, iterations=iterations, cut=cut, message=answer.message + (CUTS if cut else ""))
-        answer = replace(again, iterations=iterations)
+            break
+        answer, former, left = again, left, program.dips.left(*_plan(task, again))[0]
+        if number + 1 >= EXCHANGES and (left <= TOLERANCE or abs(left - former) <= SAME * former):
+            break
+    cut = bool(program.dips.cut(*_plan(task, answer))[0])
+    return replace(answer, iterations=iterations, cut=cut, message=answer.message + (CUTS if cut else ""))
+
+
+def _plan(task: Task, answer: Answer) -> tuple[Array, Array, Array, Array]:
+    """(t, x, u, p) of an answer, as a batch of one."""
+    t = task.t if answer.t is None else answer.t
+    return t[None], answer.x[None], answer.u[None], np.zeros((1, 0)) if task.p is None else task.p[None]
+
+
+def _inside(program: Transcription, task: Task, start: Answer) -> Answer:
+    """Solved with the margins of a solution, from it: with a small barrier, else with the usual one, else by IPOPT."""
+    plan = _plan(task, start)
+    one = (task.x0, plan[0][0], start.x, start.u, task.time_limit, task.p, program.dips.margins(*plan)[0])
+    others = (program.warm, program, *([program.second] if program.backend == "fatrop" else []))
+    for way in others:
+        answer = way.solve(*one)
+        if answer.success:
+            break
     return answer
-
-
-def _inside(program: Transcription, task: Task, t: Array, start: Answer, margin: Array) -> Answer:
-    """Solved from a solution without these margins: with a small barrier, or if that fails with the usual one."""
-    one = (task.x0, t, start.x, start.u, task.time_limit, task.p, margin)
-    warm = program.warm.solve(*one)
-    return warm if warm.success else program.solve(*one)
 
 
 def solved_by(ocp: OCP, t: Array, outcomes: Sequence[Outcome], p: Array | None = None,

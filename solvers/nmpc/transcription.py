@@ -486,9 +486,10 @@ class Transcription:
 
     @cached_property
     def dips(self) -> Dips:
-        """What its constraints along the trajectory dip by between nodes."""
+        """What its hard inequalities along the trajectory dip by between nodes."""
         of = self.functions
-        return Dips(of, of.rows.column / ca.DM(of.scales), of.rows.equal)
+        soft = np.array([name in self.eased for name in of.rows.names], dtype=bool)
+        return Dips(of, of.rows.column / ca.DM(of.scales), of.rows.equal | soft, self.substeps)
 
     @cached_property
     def elastic(self) -> Transcription:

@@ -20,13 +20,24 @@ from nocl.support.checks import Array
 FILE = Path(__file__).parents[1] / "data" / "gaps.json"
 PROBLEMS = ("pendulum", "cartpole", "acrobot", "quadrotor", "dubins")
 DYNAMICS = ("exact", "learned")
+GOALS = ("cartpole", "quadrotor")  # those that a controller of every goal ships for, too; it is asked at the usual one
 STATES, SEED = 10, 2024
 FINE = 320  # intervals
 
 
-def costs(problem: str, dynamics: str, x0: Array) -> Array:
-    """[B], the judge's cost of the shipped controller as continuous feedback from x0 [B, nx]; inf where it failed."""
-    return np.asarray(nocl.simulate(nocl.load_ocp(problem), nocl.pretrained(problem, dynamics), x0).cost)
+def shipped(problem: str) -> dict[str, nocl.CND]:
+    """The controllers of a problem, by a name of each."""
+    found = {dynamics: nocl.pretrained(problem, dynamics) for dynamics in DYNAMICS}
+    if problem in GOALS:
+        for dynamics in DYNAMICS:
+            every = nocl.pretrained(f"{problem}-goals", dynamics)
+            found[f"goals, {dynamics}"] = every.at(every.ocp.nominal)
+    return found
+
+
+def costs(problem: str, law: nocl.CND, x0: Array) -> Array:
+    """[B], the judge's cost of a controller as continuous feedback from x0 [B, nx]; inf where it failed."""
+    return np.asarray(nocl.simulate(nocl.load_ocp(problem), law, x0).cost)
 
 
 def searched(problem: str, x0: Array) -> Array:
@@ -40,15 +51,14 @@ def optimum(problem: str, x0: Array) -> Array:
     coarse, fine = DDP(ocp), DDP(ocp, intervals=FINE, constraints="soft")
     found = solve_globally(coarse, x0, seed=0)
     guesses = [np.repeat(found.u, FINE // coarse.intervals, axis=1)]
-    for dynamics in DYNAMICS:
-        guesses.append(nocl.simulate(ocp, nocl.pretrained(problem, dynamics), x0, nodes=FINE + 1).u[:, :-1])
+    guesses += [nocl.simulate(ocp, law, x0, nodes=FINE + 1).u[:, :-1] for law in shipped(problem).values()]
     return np.min([fine.solve(x0, u=u).cost for u in guesses], axis=0)
 
 
 def measured(problem: str) -> dict[str, object]:
     x0 = nocl.load_ocp(problem).initial_states.sample(STATES, SEED)
     best = optimum(problem, x0)
-    gaps = {dynamics: (costs(problem, dynamics, x0) / best - 1).tolist() for dynamics in DYNAMICS}
+    gaps = {name: (costs(problem, law, x0) / best - 1).tolist() for name, law in shipped(problem).items()}
     return {"x0": x0.tolist(), "best": best.tolist(), "searched": searched(problem, x0).tolist(), "gap": gaps}
 
 
