@@ -75,7 +75,8 @@ def gap(policy: Policy, torch_ocp: InTorch, best: Solution, unit: float = 0.0, s
     """(J - J*) / (|J*| + SMALL unit) [B] of the policy as continuous feedback, from where the solutions start."""
     start = Problems(best.x[:, 0], best.t[:, 0], best.parameters)
     J = continuous_cost(policy, torch_ocp, start, substeps * best.u.shape[1])
-    shares: Array = (J - best.cost) / (np.abs(best.cost) + SMALL * unit)
+    with np.errstate(invalid="ignore"):  # inf - inf where neither is known
+        shares: Array = (J - best.cost) / (np.abs(best.cost) + SMALL * unit)
     return shares
 
 
