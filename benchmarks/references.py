@@ -37,8 +37,8 @@ LONG = 12.0  # s of the reference that windows are taken from
 
 
 def tracking(reference: ca.SX, p: ca.SX, parameters: nocl.Uniform, horizon: float) -> nocl.OCP:
-    """A cart-pole that holds its pole up while the cart follows a reference, from where it can: its force is bounded, and
-    a pole that leans by 0.3 rad and falls at 0.6 rad/s is not caught any more."""
+    """A cart-pole that holds its pole up while the cart follows a reference, from where it can: its force is bounded,
+    and a pole that leans by 0.3 rad and falls at 0.6 rad/s is not caught any more."""
     system = cartpole.system()
     x, u = system.x, system.u
     off = ca.vertcat(x[0] - reference, 0.3 * x[1], x[2], 0.3 * x[3])

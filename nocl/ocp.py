@@ -122,7 +122,7 @@ class OCP:
         if self.np:
             self._warn_of_goal(owner)
         if self.kinks:
-            warnings.warn(f"{owner}: {self.not_smooth}", UserWarning, stacklevel=3)
+            warnings.warn(f"{owner}: {self.not_smooth}", UserWarning, stacklevel=4)
 
     def _set(self, **values: object) -> None:
         for key, value in values.items():
@@ -304,7 +304,7 @@ class OCP:
             worst = int(h[i].argmin())
             warnings.warn(f"{owner}: the goal itself does not hold {rows.of[i].title} at {(h[i] < 0).sum()} of "
                           f"{len(p)} parameters tried, worst{self.at_p(p[worst])}, by {-h[i, worst]:.3g}: what ends "
-                          "there cannot reach it; move the goal, or where `parameters` lie", UserWarning, stacklevel=4)
+                          "there cannot reach it; move the goal, or where `parameters` lie", UserWarning, stacklevel=5)
 
     @property
     def _box_of_x(self) -> tuple[Array, Array]:

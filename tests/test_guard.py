@@ -149,10 +149,10 @@ def stuck_from(monkeypatch):
     def make(limit, backends=("fatrop",)):
         original = Transcription._solve
 
-        def solve(self, x0, t, x, u, p):
+        def solve(self, x0, t, x, u, p, *more):
             if self.backend in backends and x0[0] > limit:
                 time.sleep(3600.0)
-            return original(self, x0, t, x, u, p)
+            return original(self, x0, t, x, u, p, *more)
 
         monkeypatch.setattr(Transcription, "_solve", solve)
         shared_program.cache_clear()
