@@ -36,9 +36,11 @@ def _near(report: Results, summary: Sequence[Row]) -> list[str]:
     if not n:
         return []
     if np.count_nonzero(answers) == 1:
-        m = int(answers.argmax())
+        m, cheaper = int(answers.argmax()), int((report.beaten & report.counted).sum())
+        beside = f"simple baselines cost less on {cheaper} of {n}" if cheaper else \
+            "there is nothing to compare its cost with"
         return [f"Only {summary[m]['method']} has answers that count, on {_share(100 * answers[m] / n, n)} initial "
-                "states: there is nothing to compare its cost with."]
+                f"states: {beside}."]
     near = [f"{row['method']} on {_share(row['within_5'], n)}{_gap_text(row)}" for row in summary]
     return [f"Within 5 % of the best known cost of {count(n, 'initial state')}: " + ", ".join(near) + "."]
 
