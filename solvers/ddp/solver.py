@@ -221,9 +221,11 @@ class DDP:
         for number in range(MOST):
             margin = self.rows.margins(dips.margins(t, work.x, work.u, work.p), u)
             work.exchange(work.with_margin(margin))
-            former, left = left, dips.left(t, work.x, work.u, work.p)
-            open_ = (work.state == CONVERGED) & ~(left <= TOLERANCE)
-            if number + 1 >= EXCHANGES and not (np.abs(left - former)[open_] > SAME * former[open_]).any():
+            with np.errstate(invalid="ignore"):  # plans that failed may be anything
+                former, left = left, dips.left(t, work.x, work.u, work.p)
+                open_ = (work.state == CONVERGED) & ~(left <= TOLERANCE)
+                moved = np.abs(left[open_] - former[open_]) > SAME * former[open_]
+            if number + 1 >= EXCHANGES and not moved.any():
                 break
         work.cut[:] = open_
 
