@@ -171,7 +171,7 @@ class Cell:
     way: str
     seed: int
     key: dict[str, Any]
-    gap: list[float]  # (J - J*) / J* of each, inf where the run failed
+    gap: list[float]  # (J - J*) / J* of each, inf where the run failed, NaN where no J* is known
     collisions: int
     identify: float  # s of learning f(x, u, p); 0 on the exact f
     seconds: float  # of training, wall-clock
@@ -234,7 +234,8 @@ class Goals(table.PaperTable[Plan, Cell, Entry]):
         return [("problem: parameters", lambda e: PROBLEMS[e.problem][0]),
                 ("trained on", lambda e: self.ways[e.way].title),
                 ("median gap %", lambda e: number(e.median)), ("95th percentile", lambda e: number(e.p95)),
-                ("worst", lambda e: number(e.worst)), ("collisions", lambda e: f"{e.collisions} of {e.n}"),
+                ("worst", lambda e: number(e.worst)), ("collisions", lambda e: str(e.collisions)),
+                ("(x0, p) with a known optimum", lambda e: str(e.n)),
                 ("training s", lambda e: number(e.seconds)), ("CPU s", lambda e: number(e.cpu)),
                 ("f learned s", lambda e: number(e.identify) if e.identify else "")]
 
@@ -254,7 +255,7 @@ class Goals(table.PaperTable[Plan, Cell, Entry]):
         figure = Figure(figsize=(7, 4.2), layout="constrained")
         axes = figure.subplots()
         for e in entries:
-            gaps = np.sort(100 * np.concatenate([c.gap for c in cells if (c.problem, c.way) == (e.problem, e.way)]))
+            gaps = np.sort(_gaps([c for c in cells if (c.problem, c.way) == (e.problem, e.way)]))
             axes.step(np.maximum(gaps, 1e-4), np.arange(1, len(gaps) + 1) / len(gaps), where="post",
                       label=f"{PROBLEMS[e.problem][0]}, {self.ways[e.way].title}", lw=1.3)
         axes.set(xscale="log", xlabel="gap to the optimum at its own p [%]", ylabel="share of (x0, p)", ylim=(0, 1.01))
@@ -263,14 +264,15 @@ class Goals(table.PaperTable[Plan, Cell, Entry]):
 
 
 def judged(problem: str, cnd: Any, n: int, seed: int) -> tuple[Array, int]:
-    """(gap of each fresh (x0, p), collisions) to the best of `optima` and of what the controller's own runs lead to."""
+    """(gap of each fresh (x0, p), collisions) to the best of `optima` and of what the controller's own runs lead to; inf
+    where the run failed, NaN where it did not and no plan was found that holds the constraints."""
     ocp = PROBLEMS[problem][1]()
     x0, p = drawn(ocp, n, seed)
     own, reference = with_reference(compare(ocp, {"CND": cnd}, x0=x0, p=p, progress=False), FINE).judged
     best = np.minimum(optima(problem, n, seed), _held(reference))
-    known = own.simulation.success & np.isfinite(best)
-    gap = np.divide(own.simulation.cost - best, np.abs(best), out=np.full(len(best), np.inf), where=known)
-    return gap, int((own.simulation.violation > 0).sum())
+    cost, known = own.simulation.cost, np.isfinite(best)
+    gap = np.divide(cost - best, np.abs(best), out=np.full(len(best), np.nan), where=known)
+    return np.where(own.simulation.success, gap, np.inf), int((own.simulation.violation > 0).sum())
 
 
 @lru_cache(maxsize=1)  # the ways of a problem come one after the other
@@ -288,9 +290,15 @@ def _held(judged: Judged) -> Array:
     return np.where(judged.simulation.success, judged.simulation.cost, np.inf)
 
 
-def _entry(problem: str, way: str, cells: Sequence[Cell]) -> Entry:
+def _gaps(cells: Sequence[Cell]) -> Array:
+    """The gaps that are known, in per cent."""
     gap = 100 * np.concatenate([c.gap for c in cells])
-    median, p95 = np.percentile(gap, [50, 95], method="higher")
+    return gap[~np.isnan(gap)]
+
+
+def _entry(problem: str, way: str, cells: Sequence[Cell]) -> Entry:
+    gap = _gaps(cells)
+    median, p95 = np.percentile(gap if len(gap) else [math.nan], [50, 95], method="higher")
     known = {what: float(np.mean([getattr(c, what) for c in cells])) for what in ("identify", "seconds", "cpu")}
     worst = float(gap.max()) if len(gap) else math.nan
     return Entry(problem, way, float(median), float(p95), worst, sum(c.collisions for c in cells), len(gap), **known)
