@@ -264,7 +264,7 @@ class Goals(table.PaperTable[Plan, Cell, Entry]):
 
 
 def judged(problem: str, cnd: Any, n: int, seed: int) -> tuple[Array, int]:
-    """(gap of each fresh (x0, p), collisions) to the best of `optima` and of what the controller's own runs lead to; inf
+    """(gap of each fresh (x0, p), collisions) to the best of `optima` and of what the controller's runs lead to; inf
     where the run failed, NaN where it did not and no plan was found that holds the constraints."""
     ocp = PROBLEMS[problem][1]()
     x0, p = drawn(ocp, n, seed)
