@@ -1,10 +1,12 @@
 """The problems of the table of goals are the bundled ones at some p, and its rows say what was judged."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import nocl
-from nocl.comparisons.reproduce.goals import CLEAR, PROBLEMS, TABLE, Cell, drawn
+from nocl.comparisons.reproduce.goals import CLEAR, PROBLEMS, TABLE, Cell, _entry, drawn
 
 OF = {"cartpole-goal": ("cartpole", {"goal": 0.0}),
       "cartpole-pole": ("cartpole", {"l": 1.0, "m_pole": 0.1, "goal": 0.0}),
@@ -28,6 +30,14 @@ def test_at_the_bundled_constants_it_is_the_bundled_problem(name):
         np.testing.assert_allclose(a.full(), b.full(), rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(np.r_[one.x_goal, one.u_goal], np.r_[known.x_goal, known.u_goal])
     assert one.horizon == known.horizon
+
+
+def test_what_no_optimum_is_known_of_counts_in_no_gap():
+    cell = Cell("dubins-obstacle", "exact", 0, {}, [0.01, float("nan"), 0.03], 0, 0.0, 1.0, 1.0)
+    entry = _entry("dubins-obstacle", "exact", [cell])
+    assert (entry.n, entry.worst) == (2, 3.0)
+    failed = _entry("dubins-obstacle", "exact", [replace(cell, gap=[0.01, float("inf")])])
+    assert (failed.n, failed.worst) == (2, float("inf"))
 
 
 def test_what_is_judged_begins_and_ends_clear_of_the_obstacle():

@@ -63,7 +63,7 @@ class NMPC:
         its control, and those of the end at the last node; "soft": the penalty of ocp.L_soft in the cost instead, where
         all are inequalities of (x, t, p)
     between : whether hard inequalities hold between nodes too, all but exactly: by margins at the nodes, exchanged
-        twice, each time for as much as the plan dips between them
+        twice or more, each time for as much as the plan dips between them; `Solution.cut` where that is not enough
     soft : names of constraints that an exact penalty holds: they are held where they can be, and exceeded where not, by
         as little as may be; `cost` has the penalty in it, and the Solution's `slack` says by how much
     seed : of the random starts
