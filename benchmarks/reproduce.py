@@ -5,6 +5,7 @@
     python benchmarks/reproduce.py dubins RUN      # -> results/reproduce_dubins.json: the table's rows
     python benchmarks/reproduce.py approaches RUN  # -> results/reproduce_approaches.json: problem, way
     python benchmarks/reproduce.py goals RUN       # -> results/reproduce_goals.json: the table's rows
+    python benchmarks/reproduce.py goals RUN --add # ... those that RUN does not have stay as they are
 
 The tables themselves, over the seeds and beside the paper's numbers, are RUN/gym.md, RUN/quadrotor.md and so on.
 """
@@ -12,6 +13,7 @@ The tables themselves, over the seeds and beside the paper's numbers, are RUN/gy
 from __future__ import annotations
 
 import argparse
+import json
 import math
 from dataclasses import asdict
 from pathlib import Path
@@ -49,6 +51,13 @@ def plain(row: Any) -> dict[str, Any]:
             for name, value in asdict(row).items()}
 
 
+def added(table: str, rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The kept rows of a table, those of the same problem and way replaced by `rows`."""
+    kept = json.loads((provenance.RESULTS / f"reproduce_{table}.json").read_text())
+    before = [{"commit": kept["made"]["commit"]} | row for row in kept["rows"]]
+    return list({(row.get("problem"), row["way"]): row for row in [*before, *rows]}.values())
+
+
 def digits(x: float) -> float:
     return float(f"{x:.5g}")
 
@@ -57,9 +66,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("table", choices=[*CONTROL, *ENTRIES, "approaches"])
     parser.add_argument("run", type=Path)
+    parser.add_argument("--add", action="store_true", help="keep the rows of problems and ways that RUN does not have")
     options = parser.parse_args()
     if table := ENTRIES.get(options.table):
-        rows = [plain(entry) for entry in table.entries(table.finished(options.run))]
+        rows = [plain(entry) | {"commit": provenance.STARTED} for entry in table.entries(table.finished(options.run))]
+        rows = added(options.table, rows) if options.add else rows
     elif options.table == "approaches":
         rows = [plain(cell) for cell in approaches.TABLE.finished(options.run)]
     else:
