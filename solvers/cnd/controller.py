@@ -55,7 +55,6 @@ class CND:
     def __init__(self, ocp: OCP, policy: FeatureNet, value: FeatureNet | None = None,
                  card: Mapping[str, Any] | None = None) -> None:
         checks.problem(ocp, "CND")
-        ocp.refuse_free("CND")
         checks.instance(FeatureNet, policy, "policy", "CND", "as nocl.train makes it")
         if value is not None:
             checks.instance(FeatureNet, value, "value", "CND", "as nocl.train makes it, or None")
@@ -179,7 +178,7 @@ class CND:
     def export_parts(self) -> list[ExportPart]:
         """What is exported: policy, gain and closed loop, and value and value gradient where it has a value."""
         s, policy, value = self.ocp.system, self.policy, self.value_net
-        box = {"x": (s.lbx, s.ubx), "t": (0.0, self.ocp.horizon)}
+        box = {"x": (s.lbx, s.ubx), "t": (0.0, self.ocp.longest)}
         x, u = {"x": [s.unit(n) for n in s.state_names]}, [s.unit(n) for n in s.control_names]
         if self.ocp.np:
             box["p"], x["p"] = self.ocp.parameter_box, [self.ocp.unit(n) for n in self.ocp.parameter_names]
@@ -262,9 +261,9 @@ class CND:
 
     def _tensors(self, rows: Array, t: ArrayLike, p: Any) -> tuple[Tensor, ...]:
         times = checks.numeric(t, "t", self.ocp.system.name, f"one time or {len(rows)}")
-        if times.shape not in ((), (len(rows),)) or not ((times >= 0) & (times <= self.ocp.horizon * (1 + 1e-9))).all():
+        if times.shape not in ((), (len(rows),)) or not ((times >= 0) & (times <= self.ocp.longest * (1 + 1e-9))).all():
             raise ValueError(f"t is {np.array2string(times, threshold=4)}; expected one time or {len(rows)}, "
-                             f"each in [0, {self.ocp.horizon:g}]")
+                             f"each in [0, {self.ocp.longest:g}]")
         values = self.ocp.parameters_of(p, len(rows), f"CND on {self.ocp.system.name!r}")
         given = [rows.copy(), np.broadcast_to(times, len(rows)).copy()[:, None], *([values] if self.ocp.np else [])]
         return tuple(torch.from_numpy(value) for value in given)

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 DEGREE = 6  # of the polynomials in time
 CONSTANT = 1e-6  # of its usual size: what varies less is as good as constant
+NEAR = 0.01  # of a usual size: distances that small are told apart
 LEAST_TIME = 0.025  # of the horizon: time to go is never counted as less
 Part = tuple[ca.SX, Array | float]  # features [k], and the usual size of each
 
@@ -98,17 +99,38 @@ def features(ocp: OCP, labels: Places, dt: Array | None = None, *, plain: bool =
                          *_of_parameters(ocp, at, off, labels, tau, moment),
                          *([] if own is None else [(at.but("dt").call(own), 0.0)]),
                          *([] if dt is None else [(at["dt"], ocp.horizon)])]
+    return _scaled(ocp, at, parts, at.columns(x=x, t=t, p=labels.p, dt=dt))
+
+
+def _scaled(ocp: OCP, at: Arguments, parts: list[Part], given: list[Array]) -> ca.Function:
+    """The features with mean 0 and standard deviation 1 over labels `given`, a column each."""
     raw = ca.vertcat(*(e for e, _ in parts))
     usual = np.concatenate([np.broadcast_to(size, e.numel()) for e, size in parts])
-    given = at.columns(x=x, t=t, p=labels.p, dt=dt)
-    some = slice(None, None, -(-len(t) // 20_000))  # of every kind of label
+    some = slice(None, None, -(-given[0].shape[1] // 20_000))  # of every kind of label
     values = at.function("raw", {"raw": raw})(*(a[:, some] for a in given)).full()
     if not np.isfinite(values).all():
-        raise ValueError(f"features of {s.name!r} are NaN or inf at some labels; expected expressions that are finite "
-                         "all over X")
+        raise ValueError(f"features of {ocp.system.name!r} are NaN or inf at some labels; expected expressions "
+                         "that are finite all over X")
     usual = np.where(usual > 0, usual, np.abs(values).max(axis=1, initial=1e-300))
     centre, width = values.mean(axis=1), values.std(axis=1) + CONSTANT * usual
     return at.function("features", {"phi": (raw - ca.DM(centre)) / ca.DM(width)})
+
+
+def without_clock(ocp: OCP, labels: Places, own: ca.Function | None = None) -> ca.Function:
+    """(x, t[, p]) -> phi of a law that knows no time: the state, and its distance from the goal on a scale that tells
+    small ones apart too, asinh of it in units of NEAR of a usual size."""
+    s, at = ocp.system, ocp.functions.feedback()
+    state, half = at["x"], usual_sizes(ocp).x
+    once = [i for i in range(s.nx) if i not in ocp.periodic]
+    off = state - (ocp.goal(at["p"])[0] if ocp.goal_varies else ca.DM(ocp.x_goal))
+    left = ca.vertcat(*(ca.sin(off[i]) if i in ocp.periodic else off[i] for i in range(s.nx)))
+    angles = [g(state[i]) for i in s.angle_indices for g in (ca.sin, ca.cos)]
+    parts: list[Part] = [(state[once], half[once]), (ca.vertcat(*angles), 1.0),
+                         (ca.asinh(left / (NEAR * half)), 1.0), *([] if own is None else [(at.call(own), 0.0)])]
+    if ocp.np:
+        low, high = ocp.parameter_box
+        parts.append((at["p"], np.where(high > low, (high - low) / 2, 1.0)))
+    return _scaled(ocp, at, parts, at.columns(x=labels.x, t=labels.t, p=labels.p))
 
 
 def _standard(e: ca.SX, values: Array, tau: ca.SX, moment: Array, half: Array) -> ca.SX:
@@ -168,8 +190,13 @@ def policy_net(ocp: OCP, labels: Labels, sizes: tuple[int, ...], control_dt: boo
     control_dt: (x, t[, p], dt) -> u in place of (x, t[, p]) -> u. own: further features. With `branches` > 1 the
     network says as many y, and a number for each: that with the largest number is taken.
     """
+    return net_on(ocp, features(ocp, labels, labels.dt if control_dt else None, own=own), labels, sizes, branches)
+
+
+def net_on(ocp: OCP, phi: ca.Function, labels: Labels, sizes: tuple[int, ...],
+           branches: int = 1) -> tuple[FeatureNet, ca.Function]:
+    """The same on features phi."""
     s = ocp.system
-    phi = features(ocp, labels, labels.dt if control_dt else None, own=own)
     mean, spread = ca.DM(labels.u.mean(axis=0)), ca.DM(labels.u.std(axis=0) + 1e-9 * usual_sizes(ocp).u)
     said = branches * (s.nu + 1) if branches > 1 else s.nu
     y, u = ca.SX.sym("y", said), ca.SX.sym("u", s.nu)

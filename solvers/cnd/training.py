@@ -39,6 +39,7 @@ from nocl.solvers.cnd.held import Held
 from nocl.solvers.cnd.identity import identity
 from nocl.solvers.cnd.in_torch import InTorch
 from nocl.solvers.cnd.labels import KEPT, NEIGHBOURS, Labels, Problems, answered, at_other_rates, rivals, tube, visited
+from nocl.solvers.cnd.laws import LawTraining, check_law
 from nocl.solvers.cnd.paper import PaperSettings, train_paper
 from nocl.solvers.cnd.regress import fit_net, policy_loss
 from nocl.solvers.cnd.settings import TrainSettings
@@ -113,11 +114,13 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
             raise ValueError("train: features are for the default method; 'paper' has the paper's own: leave them out")
         policy, value, card = train_paper(ocp, dynamics, chosen, seed=seed, progress=progress, checkpoint=checkpoint)
         return CND(ocp, policy, value, card)
-    ocp.refuse_free("train")
-    ocp.check_strict("train")
     own = own_features(ocp, features)
     usual = TrainSettings.of("normal", parameters=ocp.np)
     chosen = usual if settings is None else _expect(settings, TrainSettings)
+    if ocp.is_free:
+        check_law(ocp, dynamics, chosen)
+        return LawTraining(ocp, chosen, seed, progress, own).run()
+    ocp.check_strict("train")
     return Training(ocp, dynamics, chosen, seed, out, progress, own).run()
 
 

@@ -1,22 +1,8 @@
-"""The judge: any controller on the exact f under CVODES, the cost as an extra state. B is the batch, K the intervals.
-
-Three kinds of control are judged alike:
-
-- continuous feedback, where the controller is a CasADi Function policy:(x, t) -> u or has `to_casadi()`: the policy
-  stands inside the ODE;
-- sampled feedback, where it is any callable (x [B, nx], t) -> u [B, nu], or with `hold=K`: asked at the start of each
-  of K equal intervals, its answer held;
-- open loop, where it is an array u [B, K, nu]: held.
-
-On a problem with parameters they are functions of (x, t, p), p [B, np]; those of a problem without, of (x, t).
-
-The judge clips every control to U, and starts CVODES anew wherever a control or a state jumps. Constraints are judged
-between the nodes too, at BETWEEN times in each interval, those that hold the control under the one that acts there.
-"""
+"""Runs under CVODES on one problem and plant, and what is told of them. B is the batch, K the intervals."""
 
 from __future__ import annotations
 
-import inspect
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,20 +11,19 @@ from typing import Any
 
 import casadi as ca
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
-from nocl.constraints import TOLERANCE
 from nocl.ocp import OCP
 from nocl.scales import units
 from nocl.smoothness import kinks
-from nocl.support import checks, interrupt
+from nocl.support import interrupt
 from nocl.support.checks import Array
 from nocl.translate.arguments import Arguments
 
-Kicks = Sequence[tuple[float, ArrayLike]]
 MULTISTEP = ("adams", "bdf")  # the second, for stiff loops, where the first gives up; same tolerances
 BETWEEN = 8  # times in an interval that constraints are judged at
 AT_BOUND = 1e-9  # of the width of U: closer than this counts as saturated
+Ask = Callable[[Array, float, int], Array]  # (x [B, nx], t, interval) -> u [B, nu]
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +34,7 @@ class Simulation:
     more than the tolerance: what it cost is told, and counts in no comparison.
     """
 
-    t: Array  # [K+1] nodes
+    t: Array  # [K+1] nodes; [B, K+1], each run's own, where the horizon is free
     x: Array  # [B, K+1, nx], NaN after a failure; a kick at a node is included
     u: Array  # [B, K+1, nu], clipped to U; a held control stands for [t_k, t_{k+1}), the last one twice
     cost: Array  # [B], running + terminal, inf where the horizon was not reached
@@ -67,227 +52,19 @@ class Simulation:
     worst: NDArray[np.int64]  # [B], which row of OCP.shares is violated most; -1: none is
 
 
-def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: int | None = None, nodes: int = 81,
-             kicks: Kicks | None = None, delay: float = 0.0, t0: float = 0.0, p: Any = None, rtol: float = 1e-9,
-             atol: float = 1e-10, tolerance: float = TOLERANCE) -> Simulation:
-    """Run and score a controller on an OCP from states x0 [nx] or [B, nx].
-
-    Parameters
-    ----------
-    controller : policy:(x, t[, p]) -> u as a casadi.Function or by `to_casadi()`, callable, or controls [B, K, nu]
-    p : parameters, where the problem has them: [np] for all, [B, np], or by name (OCP.parameters_of)
-    f : casadi.Function (x, u[, t][, p]) -> xdot, or an object with `to_casadi()`
-        Another plant than the exact one.
-    hold : K, sample the feedback at K equal intervals; default: continuous where it can be, else nodes - 1
-    nodes : number of nodes that continuous feedback is recorded at
-    kicks : (time, dx [nx] or [B, nx]), added to the state at that time
-    delay : time from a sample of the state to its control, at most an interval; the last control acts meanwhile. The
-        first control is there at once: where a run starts is known before it does
-    t0 : start, so that a tail of the horizon can be judged
-    tolerance : a run that violates a constraint by more than this share of its scale has failed
-
-    Raises ValueError for shapes that do not fit, and for a problem whose horizon is free. A state that blows up or a
-    NaN control is a row with success False.
-    """
-    checks.problem(ocp, "simulate")
-    ocp.refuse_free("simulate")
-    check_made_for(ocp, controller, "the controller")
-    rows, _ = checks.states(x0, ocp.system.nx, ocp.system.name)
-    t0 = _check_options(ocp, hold, nodes, t0)
-    for name, value in (("rtol", rtol), ("atol", atol)):
-        checks.number(value, name, "simulate", positive=True)
-    most = checks.number(tolerance, "tolerance", "simulate")
-    values = ocp.parameters_of(p, len(rows), "simulate")
-    judge = _Judge(ocp, dynamics_function(ocp, f), values, float(rtol), float(atol), most)
-    jumps = _jumps(ocp, kicks, len(rows), t0)
-    policy = policy_function(ocp, controller)
-    if policy is not None and hold is None:
-        _check_delay(delay, 0.0, "continuous feedback: give `hold`")
-        return judge.continuous(policy, rows, np.linspace(t0, ocp.horizon, nodes), jumps)
-    if isinstance(controller, (np.ndarray, list, tuple)):
-        ask, K = _open_loop(ocp, controller, len(rows), hold, t0)
-        _check_delay(delay, 0.0, "open loop, which samples nothing")
-    else:
-        ask, K = _feedback(ocp, controller, policy, values), hold or nodes - 1
-        _check_delay(delay, (ocp.horizon - t0) / K, f"feedback that is sampled {K} times: sample it less often")
-    return judge.held(ask, rows, np.linspace(t0, ocp.horizon, K + 1), jumps, delay)
-
-
-def check_made_for(ocp: OCP, thing: Any, what: str) -> None:
-    """ValueError where `thing` (a controller, a value function) was made for a problem on another system.
-
-    Other names of states and controls are refused of everything that has an `ocp`, and other parameters of what was
-    made for some. Other equations are refused of what was trained and may have been loaded (it has a card); a law that
-    is built on a model on the spot, like LQR, may be tried on the plant, and one for given parameters on others.
-    """
-    made_for = getattr(thing, "ocp", None)
-    if not isinstance(made_for, OCP):
-        return
-    names, own = made_for.parameter_names, ocp.parameter_names
-    differ = ocp.system.difference(made_for.system, equations=hasattr(thing, "card") and names == own)
-    if not differ and names and names != own:
-        differ = f"its parameters are {', '.join(names)}, not {', '.join(own) or 'none'}"
-    if differ:
-        raise ValueError(f"{what} was made for {made_for.system.name!r}, which is another system than this problem's "
-                         f"{ocp.system.name!r}: {differ}; expected one made for it (to try a controller on another "
-                         "plant, keep its problem and pass the plant's equations, simulate(..., f=))")
-
-
-def dynamics_function(ocp: OCP, f: Any) -> ca.Function:
-    """f as a casadi.Function (x, u[, t][, p]) -> xdot, its inputs under these names: the exact one for None, a
-    Function, or what `to_casadi()` returns; either is of (x, u), or of all that the system's own f is a function of."""
-    s = ocp.system
-    if f is None:
-        return ocp.functions.f
-    g = f if isinstance(f, ca.Function) else _converted(f)
-    if g is None:
-        raise ValueError(f"the dynamics are a {type(f).__name__}; expected a casadi.Function (x, u) -> xdot, "
-                         "an object with to_casadi(), or None for the exact f")
-    of = ocp.functions
-    forms = [(s.nx, s.nu), *(tuple(v.numel() for v in a.inputs) for a in (s.arguments, of.arguments))]
-    return of.on(_with_sizes(g, forms, s.nx, "the dynamics", "(x, u) -> xdot", s.name)).f
-
-
-def policy_function(ocp: OCP, controller: Any) -> ca.Function | None:
-    """The policy (x, t[, p]) -> u as a casadi.Function, or None where the controller has none; one of x alone, or of
-    (x, t), gets the rest.
-    """
-    s = ocp.system
-    g = controller if isinstance(controller, ca.Function) else _converted(controller)
-    if g is not None and g.n_out() != 1:
-        raise ValueError(f"the policy {g.name()} returns {', '.join(g.name_out())}; {s.name} needs one output, u: pick "
-                         "it (of an ONNX file with from_onnx(path, outputs=[...]))")
-    at = ocp.functions.feedback(ca.MX)
-    every = [v.numel() for v in at.inputs]
-    sizes = [] if g is None else [g.numel_in(i) for i in range(g.n_in())]
-    if g is not None and sizes in (every[:1], every[:2]) and sizes != every:
-        x = at["x"] if g.size2_in(0) == 1 else at["x"].T
-        g = at.function(g.name(), {"u": g(*[x, at["t"]][:len(sizes)])})
-    form = "(x, t) -> u" if not ocp.np else "(x, t, p) -> u"
-    return g if g is None else _with_sizes(g, [tuple(every)], s.nu, "the policy", form, s.name)
-
-
-def _converted(thing: Any) -> ca.Function | None:
-    return thing.to_casadi() if hasattr(thing, "to_casadi") else None
-
-
-def _with_sizes(g: ca.Function, forms: Sequence[tuple[int, ...]], n_out: int, what: str, form: str,
-                owner: str) -> ca.Function:
-    got = [g.numel_in(i) for i in range(g.n_in())]
-    if tuple(got) not in forms or g.numel_out(0) != n_out:
-        lengths = " or ".join(dict.fromkeys(str(list(sizes)) for sizes in forms))
-        raise ValueError(f"{what} {g.name()} takes vectors of length {got} and returns {g.numel_out(0)}; {owner} needs "
-                         f"{form} with lengths {lengths} -> {n_out}")
-    return g
-
-
-def _check_options(ocp: OCP, hold: int | None, nodes: int, t0: float) -> float:
-    """t0, a float; ValueError where one of them is wrong."""
-    if hold is not None:
-        checks.whole(hold, "hold", "simulate (None: continuous feedback)", 1)
-    checks.whole(nodes, "nodes", "simulate", 2)
-    return checks.start_time(t0, ocp.horizon)
-
-
-def _check_delay(delay: float, most: float, of: str) -> None:
-    found = checks.finite(delay)
-    if found is None or not 0 <= found <= most * (1 + 1e-9):
-        raise ValueError(f"delay is {delay!r}; expected 0 <= delay <= {most:g} for {of}")
-
-
-def _jumps(ocp: OCP, kicks: Kicks | None, B: int, t0: float) -> list[tuple[float, Array]]:
-    """The kicks in order of time, as rows [B, nx]."""
-    jumps = []
-    if not isinstance(kicks, (list, tuple, type(None))) or \
-            not all(isinstance(kick, (list, tuple)) and len(kick) == 2 for kick in kicks or ()):
-        raise ValueError(f"simulate: kicks is {checks.shown(kicks)}; expected a list of pairs (time, dx [nx] or "
-                         "[B, nx])")
-    for when, dx in kicks or ():
-        time = checks.between(when, -np.inf, np.inf, "the time of a kick", "simulate")
-        what, expected = f"the kick at t = {time:g}", f"finite ({ocp.system.nx},) or ({B}, {ocp.system.nx})"
-        d = checks.numeric(dx, what, "simulate", expected)
-        if d.shape not in ((ocp.system.nx,), (B, ocp.system.nx)) or not np.isfinite(d).all():
-            raise ValueError(f"{what} has shape {d.shape}; expected {expected}")
-        if not t0 <= time <= ocp.horizon:
-            raise ValueError(f"a kick at t = {time:g}; expected a time in [{t0:g}, {ocp.horizon:g}]")
-        jumps.append((time, np.broadcast_to(d, (B, ocp.system.nx))))
-    return sorted(jumps, key=lambda jump: jump[0])
-
-
-Ask = Callable[[Array, float, int], Array]  # (x [B, nx], t, interval) -> u [B, nu]
-
-
-def _open_loop(ocp: OCP, controls: ArrayLike, B: int, hold: int | None, t0: float) -> tuple[Ask, int]:
-    u = checks.numeric(controls, "the controls", "simulate", f"[B, K, nu] = [{B}, K, {ocp.system.nu}]")
-    if u.ndim == 2 and B == 1:
-        u = u[None]
-    if u.ndim != 3 or u.shape[0] != B or u.shape[2] != ocp.system.nu or u.shape[1] < 1:
-        raise ValueError(f"controls have shape {np.shape(controls)}; expected [B, K, nu] = [{B}, K, {ocp.system.nu}]: "
-                         "one row of K held controls for each x0")
-    if hold not in (None, u.shape[1]):
-        raise ValueError(f"hold is {hold}, but the controls have K = {u.shape[1]} intervals; expected these: leave "
-                         "hold out")
-    return (lambda x, t, k: u[:, k]), u.shape[1]
-
-
-def takes_p(ocp: OCP, controller: Any) -> bool:
-    """Whether a callable controller is one of (x, t, p): on a problem with parameters, unless made for one without."""
-    made_for = getattr(controller, "ocp", None)
-    return bool(ocp.np) and not (isinstance(made_for, OCP) and not made_for.np)
-
-
-def check_takes_p(ocp: OCP, controller: Any) -> None:
-    """ValueError where a callable controller is one of (x, t) and should be one of (x, t, p)."""
-    if not takes_p(ocp, controller):
-        return
-    try:
-        inspect.signature(controller).bind(None, 0.0, None)
-    except TypeError:
-        raise ValueError(f"the controller does not take (x, t, p), as those of a problem with the parameters "
-                         f"{', '.join(ocp.parameter_names)} do: expected a third argument, p [B, {ocp.np}]; where it "
-                         "needs none, lambda x, t, p: controller(x, t)") from None
-    except ValueError:  # a builtin without a signature
-        return
-
-
-def _feedback(ocp: OCP, controller: Any, policy: ca.Function | None, p: Array) -> Ask:
-    nu = ocp.system.nu
-    if policy is None and not callable(controller):
-        raise ValueError(f"the controller is a {type(controller).__name__}; expected a callable (x, t) -> u, "
-                         "a casadi.Function, an object with to_casadi(), or controls [B, K, nu]")
-    more = [p] if takes_p(ocp, controller) else []
-    if policy is None:
-        check_takes_p(ocp, controller)
-    columns = [p.T] if ocp.np else []
-
-    def ask(x: Array, t: float, k: int) -> Array:
-        answer = answer_of(controller, x, t, *more) if policy is None else policy(x.T, t, *columns).full().T
-        u = checks.numeric(answer, "the controller's answer", "simulate", f"[B, nu] = [{len(x)}, {nu}]")
-        if u.shape != (len(x), nu):
-            raise ValueError(f"the controller answered with shape {u.shape} at t = {t:g}; expected [B, nu] = "
-                             f"[{len(x)}, {nu}] for x of shape {x.shape}")
-        return u
-
-    return ask
-
-
-def answer_of(controller: Any, x: Array, t: float, *p: Array | None) -> Any:
-    """A callable's answer; ValueError where it does not take (x, t), or (x, t, p)."""
-    try:
-        return controller(x, t, *p)
-    except TypeError as error:
-        form = "(x [B, nx], t, p [B, np])" if p else "(x [B, nx], t)"
-        raise ValueError(f"the controller raised {error} at t = {t:g}; expected a callable {form} -> u [B, nu]"
-                         ) from error
-
-
-class _Judge:
+class Judge:
     """CVODES on one problem and plant; z = [x, integral of L]. p [B, np] are the parameters of each row."""
 
     def __init__(self, ocp: OCP, f: ca.Function, p: Array, rtol: float, atol: float, tolerance: float) -> None:
         self.ocp, self.f, self.p, self.tolerance = ocp, f, p, tolerance
         self.options = {"reltol": rtol, "abstol": atol, "quad_err_con": True, "disable_internal_warnings": True,
                         "show_eval_warnings": False, "max_num_steps": 20000}
+
+    def of(self, row: int) -> Judge:
+        """The judge of one run alone."""
+        one = copy.copy(self)
+        one.p = self.p[row:row + 1]
+        return one
 
     @cached_property
     def jumps(self) -> str:
@@ -303,7 +80,7 @@ class _Judge:
         s = self.ocp.system
         if self.jumps and (np.abs(x - (s.lbx + s.ubx) / 2) <= s.ubx - s.lbx).all():
             what = f"the integrator gave up, chattering where f jumps ({self.jumps}; try tanh(e / width) for sign(e)),"
-        return _failure(what, t, x, until)
+        return failure(what, t, x, until)
 
     def integrator(self, dae: dict[str, Any], grid: Array, method: str) -> ca.Function:
         """From 0 to the times in `grid`."""
@@ -381,7 +158,7 @@ class _Judge:
             z[:, :nx] += sum(dx for time, dx in jumps if time == a)
             x[:, t == a] = z[:, None, :nx]
             inside = (t > a) & (t < b)
-            segment = _Segment(self, dae, a, np.r_[t[inside], b])
+            segment = Segment(self, dae, a, np.r_[t[inside], b])
             for i in range(B):
                 if not message[i]:
                     path, magnitude_i, message[i] = segment.run(z[i], self.p[i])
@@ -408,7 +185,7 @@ class _Judge:
 
     def held(self, ask: Ask, x0: Array, t: Array, jumps: list[tuple[float, Array]], delay: float = 0.0) -> Simulation:
         B, nx, K, nu = len(x0), x0.shape[1], len(t) - 1, self.ocp.system.nu
-        step, least = _Step(self), np.full((B, len(self.ocp.functions.rows)), np.inf)
+        step, least = Step(self), np.full((B, len(self.ocp.functions.rows)), np.inf)
         x, u = np.full((B, K + 1, nx), np.nan), np.full((B, K + 1, nu), np.nan)
         z, message = np.c_[x0, np.zeros(B)], [""] * B
         for k in range(K):
@@ -417,7 +194,7 @@ class _Judge:
             alive = np.array([not m for m in message])
             x[alive, k] = z[alive, :nx]
             for i in np.flatnonzero(alive & ~np.isfinite(u[:, k]).all(axis=1)):
-                message[i] = _failure("the control is NaN", t[k], z[i, :nx])
+                message[i] = failure("the control is NaN", t[k], z[i, :nx])
             middle = [jump for jump in jumps if t[k] < jump[0] < t[k + 1]]
             late = t[k] + (delay if k else 0.0)
             edges = np.unique(np.r_[t[k], [time for time, _ in middle], min(late, t[k + 1]), t[k + 1]])
@@ -483,10 +260,10 @@ class _Judge:
         return np.asarray(found, dtype=np.int64)
 
 
-class _Segment:
+class Segment:
     """Continuous feedback from time a to each of `times`, built once and run state by state."""
 
-    def __init__(self, judge: _Judge, dae: dict[str, Any], a: float, times: Array) -> None:
+    def __init__(self, judge: Judge, dae: dict[str, Any], a: float, times: Array) -> None:
         self.judge, self.dae, self.a, self.times = judge, dae, float(a), times
         self.solvers = {MULTISTEP[0]: judge.integrator(dae, times - a, MULTISTEP[0])}
 
@@ -512,13 +289,13 @@ class _Segment:
                 return path, np.nan, self.judge.blow_up(a, z[:-1], float(b), "the state blows up or the control is NaN")
             path[k] = z = end[:, -1]
             a = float(b)
-        return path, np.nan, _failure("CVODES did not reach the end", self.a, z[:-1], a)
+        return path, np.nan, failure("CVODES did not reach the end", self.a, z[:-1], a)
 
 
-class _Step:
+class Step:
     """Held controls over one interval, state by state: a mapped call is a tenth faster, but fails for all at once."""
 
-    def __init__(self, judge: _Judge) -> None:
+    def __init__(self, judge: Judge) -> None:
         dae, self.m, self.judge = judge.held_dae(), judge.between, judge
         self.grid = np.arange(1, self.m + 1) / self.m
         self.solvers = [judge.integrator(dae, self.grid, method) for method in MULTISTEP]
@@ -541,6 +318,6 @@ class _Step:
         return path
 
 
-def _failure(what: str, t: float, x: Array, until: float | None = None) -> str:
+def failure(what: str, t: float, x: Array, until: float | None = None) -> str:
     when = f"at t = {t:.4g}" if until is None else f"between t = {t:.4g} and {until:.4g}"
     return f"{what} {when}, after x = {np.array2string(x, precision=4, separator=', ')}"

@@ -1,0 +1,211 @@
+"""Laws for problems whose horizon is free: u(x[, p]), from any state to where the terminal constraints hold.
+
+Without a clock what is left of a solution from any of its nodes is a solution from there, so that every node is a
+label. Rounds of states that the law visits under pushes are solved too, as in the default training.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from nocl.constraints import TOLERANCE
+from nocl.data import Solution
+from nocl.judge import simulate
+from nocl.ocp import OCP
+from nocl.sampling import own_numbers
+from nocl.solvers.cnd.controller import CND
+from nocl.solvers.cnd.features import net_on, without_clock
+from nocl.solvers.cnd.in_torch import InTorch
+from nocl.solvers.cnd.labels import Labels, Problems
+from nocl.solvers.cnd.regress import fit_net, policy_loss
+from nocl.solvers.cnd.settings import TrainSettings
+from nocl.solvers.cnd.validate import summary
+from nocl.solvers.ddp.global_search import solve_globally
+from nocl.solvers.ddp.nodes import NodeBank
+from nocl.solvers.ddp.solver import DDP, substeps_for
+from nocl.substeps import FINE
+from nocl.support.checks import Array
+from nocl.support.threads import one_thread
+
+LONGER = 1.5  # times the longest solution, that a law is followed for
+STEPS = 240  # of that
+KICKS = 4  # in it
+FAR = 10  # times X: states that a law drives out that far are not asked for
+
+
+def check_law(ocp: OCP, dynamics: Any, settings: TrainSettings) -> None:
+    """ValueError where a law without a clock is not what a problem asks for, or not to be had."""
+    name = ocp.system.name
+    if dynamics is not None:
+        ocp.refuse_free("train on learned dynamics")
+    if ocp.uses_time:
+        raise ValueError(f"train: the problem on {name!r} has a free horizon and holds the time, so that no u(x) is "
+                         "best; expected one without nocl.time(), or a number as horizon")
+    if not ocp.held_at_end:
+        raise ValueError(f"train: the problem on {name!r} has a free horizon and no terminal constraints, so that a "
+                         "law would not know where it ends; expected terminal_constraints, or a number as horizon")
+    if settings.control_dt:
+        raise ValueError("train: control_dt=True is for problems whose horizon is a number; expected False: hold the "
+                         "law's answers, simulate(..., hold=K)")
+
+
+class LawTraining:
+    """One run."""
+
+    def __init__(self, ocp: OCP, settings: TrainSettings, seed: int, progress: bool | None,
+                 own: ca.Function | None) -> None:
+        self.ocp, self.settings, self.seed, self.own = ocp, settings, seed, own
+        self.hidden_progress = None if progress is None else not progress
+        substeps = settings.substeps or substeps_for(ocp, None, settings.intervals, FINE)
+        self.ddp = DDP(ocp, intervals=settings.intervals, substeps=substeps)
+        self.loose = DDP(loosened(ocp, TOLERANCE), intervals=4 * settings.intervals, substeps=-(-substeps // 4))
+        self.in_torch = InTorch(ocp)
+        self.round, self.seconds, self.history = 0, 0.0, list[dict[str, Any]]()
+
+    def run(self) -> CND:
+        with one_thread():
+            return self._run()
+
+    def _run(self) -> CND:
+        s, begin = self.settings, time.perf_counter()
+        self._first_labels()
+        self._network()
+        while self.round <= s.rounds and not self._good_enough():
+            if self.round:
+                self._visit()
+            self._regress(s.iterations * (2 if self.round >= max(s.least_rounds, 1) else 1))
+            self._validate()
+            self.round += 1
+        self.seconds = time.perf_counter() - begin
+        return CND(self.ocp, self.net, None, self._card())
+
+    def _first_labels(self) -> None:
+        s, rng = self.settings, own_numbers(self.seed, 0)
+        with self._stage("labels", 3) as bar:
+            first = Problems.initial(self.ocp, s.seeds, rng)
+            seeds = solve_globally(self.ddp, first.x, p=first.given_p, starts=s.starts, seed=rng)
+            self.bank = NodeBank(self.ocp, seeds)
+            bar.update()
+            if s.states:
+                further = Problems.initial(self.ocp, s.states, rng)
+                self.bank = self.bank.add(self.bank.solve(self.ddp, further.x, further.p))
+            bar.update()
+            self.labels = self._labels(self.bank.solution)
+            if s.tails:
+                near = self.bank.solve(self.ddp, *self.bank.around(s.tails, s.width, rng))
+                self._learn(near)
+            bar.update()
+
+    def _labels(self, solution: Solution) -> Labels:
+        """Of solutions that end on time: those of the least horizon wait for it."""
+        s = solution[solution.success & (solution.t[:, -1] > self.ocp.horizon.low * (1 + 1e-3))]
+        return Labels.of(s, self.in_torch, self._unit(), self.ddp.substeps)
+
+    def _unit(self) -> float:
+        return float(np.median(np.abs(self.bank.solution.cost)))
+
+    def _learn(self, solution: Solution) -> None:
+        self.bank = self.bank.add(solution)
+        self.labels = Labels.join([self.labels, self._labels(solution)])
+
+    def _network(self) -> None:
+        s = self.settings
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(self.seed)
+            phi = without_clock(self.ocp, self.labels, self.own)
+            self.net, self.inverse = net_on(self.ocp, phi, self.labels, s.hidden, s.branches)
+
+    def _visit(self) -> None:
+        s, rng = self.settings, own_numbers(self.seed, self.round)
+        with self._stage(f"round {self.round}: visited states", 1) as bar:
+            x, p = self._visited(s.visits, rng)
+            self._learn(self.bank.solve(self.ddp, x, p))
+            bar.update()
+
+    def _visited(self, n: int, rng: np.random.Generator) -> tuple[Array, Array]:
+        """States [n, nx] and parameters on the law's ways, under pushes, before it arrives."""
+        start = Problems.initial(self.ocp, max(n // 8, 1), rng)
+        here, h = self.in_torch.at(start.p), LONGER * self.bank.solution.t[:, -1].max() / STEPS
+        pushed = rng.integers(0, STEPS, (KICKS, len(start)))
+        x, path = torch.from_numpy(start.x), [start.x]
+        with torch.no_grad():
+            for k in range(STEPS):
+                kick = (pushed == k).sum(axis=0)[:, None] * self.settings.kick * self.bank.scale
+                x = x + torch.from_numpy(kick * rng.standard_normal(start.x.shape))
+                t = torch.zeros(len(x), 1, dtype=x.dtype)
+                x = here.after(x, self.net(x, t, *here.p), t, h, self.ddp.substeps)
+                path.append(x.numpy())
+        states = np.stack(path, axis=1)
+        rows, nodes = np.nonzero(self._under_way(states, start.p))
+        chosen = rng.choice(len(rows), min(n, len(rows)), replace=False)
+        return states[rows[chosen], nodes[chosen]], start.p[rows[chosen]]
+
+    def _under_way(self, states: Array, p: Array) -> Array:
+        """[B, steps+1], whether states are not yet where it ends, and not far out of X."""
+        B, n, nx = states.shape
+        flat = states.reshape(-1, nx)
+        at_end = self.ocp.least_at_end(flat, np.repeat(p, n, axis=0)) / self.ocp.functions.end_scales
+        far = FAR * np.maximum(np.abs(self.ocp.system.lbx), np.abs(self.ocp.system.ubx))
+        arrived = (at_end >= -TOLERANCE).all(axis=1).reshape(B, n)
+        before = ~np.maximum.accumulate(arrived, axis=1)
+        return before & (np.abs(flat) < far).all(axis=1).reshape(B, n)
+
+    def _regress(self, iterations: int) -> None:
+        s = self.settings
+        loss = policy_loss(self.ocp, self.net, self.inverse, self.labels)
+        with self._stage(f"round {self.round}: law", iterations) as bar:
+            fit_net(self.net, loss, len(self.labels), iterations=iterations, batch=s.batch, lr=s.lr,
+                    seed=self.seed + self.round, report=lambda _: bar.update())
+
+    def _validate(self) -> None:
+        """The gap of runs, as the judge sees them, to the least cost of arriving as near."""
+        s, rng = self.settings, own_numbers(self.seed, 1_000_000)
+        with self._stage("held-out states", 1) as bar:
+            fresh = Problems.initial(self.ocp, s.held_out, rng)
+            best = self.bank.solve(self.loose, fresh.x, fresh.p, 4)
+            run = simulate(self.ocp, CND(self.ocp, self.net, None, {}), fresh.x, p=fresh.given_p)
+            gap = np.where(run.success, run.cost, np.inf) / np.where(best.success, best.cost, np.nan) - 1
+            known = gap[best.success]
+            self.net.double()
+            bar.update()
+        self.history.append({"round": self.round, "labels": len(self.labels), "unsolved": int((~best.success).sum()),
+                             "arrived": float(run.reached.mean()), **summary(known, "gap")})
+        bar.set_postfix_str(str(self.history[-1]))
+
+    def _good_enough(self) -> bool:
+        if self.round <= self.settings.least_rounds:
+            return False
+        last, s = self.history[-1], self.settings
+        return bool(last["gap_median"] <= s.gap_median and last["gap_p95"] <= s.gap_p95)
+
+    def _card(self) -> dict[str, Any]:
+        last = self.history[-1]
+        return {"method": "default", "dynamics": "exact", "seed": self.seed, "seconds": round(self.seconds, 1),
+                **{name: last[name] for name in ("gap_median", "gap_p95", "arrived", "unsolved")},
+                "settings": asdict(self.settings), "history": self.history}
+
+    @contextmanager
+    def _stage(self, name: str, total: int) -> Iterator[tqdm[Any]]:
+        with tqdm(total=total, desc=name, disable=self.hidden_progress, leave=True) as bar:
+            yield bar
+
+
+def loosened(ocp: OCP, share: float) -> OCP:
+    """The problem of arriving within a share of each terminal constraint's scale."""
+    rows = ocp.functions.end_rows
+    scale = dict(zip(rows.names, ocp.functions.end_scales, strict=True))
+    wider = {name: (one.low - share * scale[name], one.expression, one.high + share * scale[name])
+             for name, one in ocp.terminal_constraints.items()}
+    with warnings.catch_warnings():  # of its kinks the problem itself has warned
+        warnings.simplefilter("ignore")
+        return replace(ocp, terminal_constraints=wider, scales={**ocp.scales, **scale})
