@@ -22,7 +22,8 @@ from nocl.comparisons.report.results import (
     REFERENCE,
     Judged,
 )
-from nocl.judge import AT_BOUND, dynamics_function, policy_function
+from nocl.judge.laws import dynamics_function, policy_function
+from nocl.judge.runs import AT_BOUND
 from nocl.ocp import OCP
 from nocl.solvers.nmpc.loop import Loop
 from nocl.support.checks import Array

@@ -18,8 +18,10 @@ def base_cost(ocp: OCP, starts: Starts, tolerance: float, solving: Solving) -> A
     """[B], the least cost of simple baselines that reach the horizon with all constraints held; NaN where none does.
 
     They are a control that is held throughout, at u*, at the middle of U and at 0, and LQR, clipped to U, where the
-    goal has one.
+    goal has one. None of them ends by itself: of a free horizon nothing is known.
     """
+    if ocp.is_free:
+        return np.full(len(starts), np.nan)
     laws = {f"baseline {number}": law for number, law in enumerate(_laws(ocp), 1)}
     runs = runs_of(ocp, laws, starts, (None,), solving)
     job = Judging(ocp, starts, runs, Disturbance(), [0.0] * len(runs), timed=False, tolerance=tolerance)

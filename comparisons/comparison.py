@@ -61,7 +61,6 @@ def compare(ocp: OCP, methods: Mapping[str, Any], n: int = 100, x0: ArrayLike | 
     Raises ValueError for methods that are none, or are made for another problem.
     """
     checks.problem(ocp, "compare")
-    ocp.refuse_free("compare")
     checks.whole(seed, "seed", "compare", most=2**63)
     Pool(workers)  # refuses what is none before anything is solved
     states = starts_of(ocp, n, x0, seed, p)

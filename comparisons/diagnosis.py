@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from nocl.data import Solution
-from nocl.judge import simulate
+from nocl.judge.simulation import simulate
 from nocl.ocp import OCP
 from nocl.scales import usual_sizes
 from nocl.solvers.ddp.global_search import solve_globally

@@ -23,7 +23,8 @@ from nocl.comparisons.methods import MethodRun, Solving, Starts, at_rate, checke
 from nocl.comparisons.reference import SLOTS, Reference, resolved
 from nocl.comparisons.report.findings import Robustness, Scenario, ScenarioLoss
 from nocl.constraints import TOLERANCE
-from nocl.judge import dynamics_function, simulate
+from nocl.judge.laws import dynamics_function
+from nocl.judge.simulation import simulate
 from nocl.ocp import OCP
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 
 from nocl.data import Solution
-from nocl.judge import answer_of, policy_function
+from nocl.judge.laws import answer_of, policy_function
 from nocl.ocp import OCP
 from nocl.support import checks
 from nocl.support.checks import Array

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from nocl.comparisons.each import Laws
 from nocl.comparisons.methods import STAGES, MethodRun, Starts, said, substeps_of
 from nocl.constraints import TOLERANCE
-from nocl.judge import Simulation, simulate
+from nocl.judge.runs import Simulation
+from nocl.judge.simulation import simulate
 from nocl.ocp import OCP
 from nocl.solvers.nmpc.loop import Loop
 from nocl.support.checks import Array
@@ -137,7 +138,7 @@ class Judging:
         return job.judge(replace(run, controller=controller), np.array([row]), delay)
 
     def _nodes(self, K: int) -> Array:
-        return np.linspace(0.0, self.ocp.horizon, K + 1)
+        return np.linspace(0.0, self.ocp.longest, K + 1)
 
     def _feedback(self, run: MethodRun, rows: Rows, delay: float) -> Judgement:
         starts, controller, d = self.starts[rows], run.controller, self.disturbance
@@ -165,9 +166,9 @@ class Judging:
         return Judgement(s, run.solved.ms[rows], np.full(len(rows), np.nan), run.solved.evaluations[rows])
 
     def _open_loop(self, run: MethodRun, rows: Rows, kicks: Sequence[tuple[float, Array]]) -> Simulation:
-        starts = self.starts[rows]
+        starts, horizon = self.starts[rows], None if run.horizon is None else run.horizon[rows]
         return simulate(self.ocp, run.controller[rows], starts.x, f=self.disturbance.f, kicks=kicks, p=starts.p,
-                        tolerance=self.tolerance)
+                        tolerance=self.tolerance, horizon=horizon)
 
 
 def _unpickled(data: bytes) -> Judging:
@@ -264,8 +265,9 @@ def _unknown(s: Simulation) -> Judgement:
 
 
 def failed(ocp: OCP, message: Sequence[str], t: Array) -> Simulation:
-    """What the judge says of states that there was nothing to run on."""
+    """What the judge says of states that there was nothing to run on; t [K]."""
     B, K = len(message), len(t)
+    t = np.tile(t, (B, 1)) if ocp.is_free else t
     inf, nan = np.full((4, B), np.inf), np.full((4, B), np.nan)
     x, u = (np.full((B, K, n), np.nan) for n in (ocp.system.nx, ocp.system.nu))
     return Simulation(t, x, u, inf[0], inf[1], inf[2], inf[3], nan[0], nan[1], nan[2], nan[3],
@@ -274,11 +276,13 @@ def failed(ocp: OCP, message: Sequence[str], t: Array) -> Simulation:
 
 def joined(ocp: OCP, parts: Sequence[Judgement]) -> Judgement:
     """Several batches of one run as one; a part that never ran takes over the grid of those that did."""
-    t = max((part.simulation.t for part in parts), key=len)
-    runs = [p.simulation if len(p.simulation.t) == len(t) else failed(ocp, p.simulation.message, t) for p in parts]
-    values = {f.name: np.concatenate([getattr(run, f.name) for run in runs]) for f in fields(Simulation)
-              if f.name not in ("t", "message")}
-    simulation = Simulation(t=t, message=[m for run in runs for m in run.message], **values)
+    t = max((part.simulation.t for part in parts), key=lambda t: t.shape[-1])
+    runs = [p.simulation if p.simulation.t.shape[-1] == t.shape[-1] else
+            failed(ocp, p.simulation.message, np.linspace(0.0, ocp.longest, t.shape[-1])) for p in parts]
+    values: dict[str, Any] = {f.name: np.concatenate([getattr(run, f.name) for run in runs])
+                              for f in fields(Simulation) if f.name not in _shared(t)}
+    shared: dict[str, Any] = {"t": t} if t.ndim == 1 else {}
+    simulation = Simulation(message=[m for run in runs for m in run.message], **shared, **values)
     return Judgement(simulation, *(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Judgement)
                                    if f.name != "simulation"))
 
@@ -289,6 +293,11 @@ def _put(simulation: Simulation, part: Simulation, where: Array) -> Simulation:
     for i, why in zip(np.flatnonzero(where), part.message, strict=True):
         message[i] = why
     for f in fields(Simulation):
-        if f.name not in ("t", "message"):
+        if f.name not in _shared(simulation.t):
             getattr(simulation, f.name)[where] = getattr(part, f.name)
     return replace(simulation, message=message)
+
+
+def _shared(t: Array) -> tuple[str, ...]:
+    """Fields of a Simulation that are no arrays with a row for each state; nodes t [K+1] are the same for all."""
+    return ("message",) if t.ndim == 2 else ("t", "message")

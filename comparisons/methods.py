@@ -24,7 +24,7 @@ import numpy as np
 from nocl.comparisons.each import Laws, is_plan
 from nocl.comparisons.report.results import Planned, count
 from nocl.data import Solution
-from nocl.judge import check_made_for, check_takes_p, policy_function, takes_p
+from nocl.judge.laws import check_made_for, check_takes_p, policy_function, takes_p
 from nocl.ocp import OCP
 from nocl.sampling import own_numbers
 from nocl.scales import usual_sizes
@@ -47,6 +47,7 @@ class MethodRun:
     controller: Any  # what the judge runs: a casadi.Function, a callable, or controls [B, K, nu], NaN where unsolved
     hold: int | None = None
     solved: Solved | None = None
+    horizon: Array | None = None  # [B], of plans whose horizon is free
 
     @property
     def held(self) -> bool:
@@ -66,7 +67,7 @@ class MethodRun:
             what = self.controller.identity
         else:
             what = getattr(self.controller, "__qualname__", type(self.controller).__qualname__)
-        return [self.name, self.hold, what]
+        return [self.name, self.hold, what, *([] if self.horizon is None else [self.horizon])]
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,11 +275,12 @@ def _check_solution(ocp: OCP, name: str, solution: Solution, starts: Starts) -> 
 def _off_grid(ocp: OCP, solution: Solution) -> str:
     """What is wrong with a solution's grid for running it in open loop, or ""."""
     t = solution.t
-    if np.allclose(t, np.linspace(0.0, ocp.horizon, t.shape[1]), rtol=0, atol=1e-9 * ocp.horizon):
+    end = t[:, -1:] if ocp.is_free else ocp.horizon
+    if np.allclose(t, end * np.linspace(0.0, 1.0, t.shape[1]), rtol=0, atol=1e-9 * ocp.longest):
         return ""
     steps = np.diff(t)
     return (f"its grid goes from {t.min():g} to {t.max():g} in steps of {steps.min():.4g} to {steps.max():.4g}; "
-            f"expected equal steps from 0 to the horizon {ocp.horizon:g}: compare it in closed loop, by controller()")
+            f"expected equal steps from 0 to the horizon {ocp.longest:g}: compare it in closed loop, by controller()")
 
 
 def solve(ocp: OCP, solver: Any, name: str, x0: Starts, solving: Solving) -> list[Solution | str]:
@@ -311,6 +313,7 @@ def planned(ocp: OCP, name: str, method: Any, parts: Sequence[Solution | str], B
     message, u = list[str](), np.full((B, K, nu), np.nan)
     plan = Planned(np.full((B, K + 1, nx), np.nan), np.full((B, K + 1, nx), np.nan))
     ms, predicted, evaluations, solves = *np.full((3, B), np.nan), np.ones(B)
+    T = np.full(B, ocp.longest)
     for s in parts:
         i = len(message)
         if isinstance(s, str):
@@ -322,14 +325,15 @@ def planned(ocp: OCP, name: str, method: Any, parts: Sequence[Solution | str], B
             continue
         rows = slice(i, i + len(s.u))
         u[rows], predicted[rows], plan.x[rows] = s.u, s.cost, s.x
-        plan.costate[rows] = s.costate
+        plan.costate[rows], T[rows] = s.costate, s.t[:, -1]
         ms[rows] = 1e3 * s.seconds
         evaluations[rows] = s.iterations * K * STAGES * substeps_of(method)
         solves[rows] = np.maximum(s.starts, 1)
         message += _unsolved(ocp, s)
     u[[bool(m) for m in message]] = np.nan
     solved = Solved(ms, solves, predicted, evaluations, plan, message)
-    return MethodRun(name, f"open loop, held on {count(K, 'interval')}", method, u, solved=solved)
+    return MethodRun(name, f"open loop, held on {count(K, 'interval')}", method, u, solved=solved,
+                     horizon=T if ocp.is_free else None)
 
 
 def substeps_of(solver: Any) -> int:

@@ -12,7 +12,7 @@ from nocl.comparisons.promise import interval
 from nocl.comparisons.reference import Reference
 from nocl.comparisons.report.findings import Region, per_cent
 from nocl.constraints import TOLERANCE
-from nocl.judge import simulate
+from nocl.judge.simulation import simulate
 from nocl.ocp import OCP
 from nocl.sampling import Distribution, Gaussian, Uniform, own_numbers
 from nocl.scales import usual_sizes

@@ -24,7 +24,7 @@ from nocl.comparisons.report.results import (
     REFERENCE,
 )
 from nocl.data import Solution
-from nocl.judge import policy_function
+from nocl.judge.laws import policy_function
 from nocl.ocp import OCP
 from nocl.scales import usual_sizes
 from nocl.solvers.ddp.solver import DDP

@@ -21,7 +21,7 @@ from nocl.comparisons.region import region
 from nocl.comparisons.report.report import Report
 from nocl.comparisons.stability import stability
 from nocl.constraints import TOLERANCE
-from nocl.judge import policy_function
+from nocl.judge.laws import policy_function
 from nocl.ocp import OCP
 from nocl.support import checks
 

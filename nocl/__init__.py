@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from nocl.data import Dataset, Solution, Trajectory
     from nocl.exports.casadi_forms import to_casadi
     from nocl.exports.interop import held_inputs, to_acados, to_control, to_do_mpc, to_gymnasium
-    from nocl.judge import simulate
+    from nocl.judge.simulation import simulate
     from nocl.solvers.cnd.controller import CND, pretrained
     from nocl.solvers.cnd.training import train
     from nocl.sysid.ensemble import Ensemble
@@ -37,7 +37,7 @@ _LAZY = {  # public name -> module: torch and the solvers are imported when firs
     "identify": "nocl.sysid.identification", "LearnedDynamics": "nocl.sysid.identification",
     "Ensemble": "nocl.sysid.ensemble", "Log": "nocl.sysid.logs.log",
     "Dataset": "nocl.data", "Solution": "nocl.data", "Trajectory": "nocl.data",
-    "load_ocp": "nocl.systems", "simulate": "nocl.judge",
+    "load_ocp": "nocl.systems", "simulate": "nocl.judge.simulation",
     "to_torch": "nocl.translate.torch_functions", "to_casadi": "nocl.exports.casadi_forms",
     "to_acados": "nocl.exports.interop", "to_control": "nocl.exports.interop", "to_do_mpc": "nocl.exports.interop",
     "to_gymnasium": "nocl.exports.interop", "held_inputs": "nocl.exports.interop",

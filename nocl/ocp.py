@@ -489,6 +489,16 @@ class OCP:
         return replace(self, constraints=each(self.constraints), path_constraints=paths,
                        terminal_constraints=each(self.terminal_constraints), **changed)
 
+    def loosened(self, share: float) -> OCP:
+        """The problem of ending within a share of each terminal constraint's scale of where it holds."""
+        rows, sizes = self.functions.end_rows, self.functions.end_scales
+        scale = {name: float(size) for name, size in zip(rows.names, sizes, strict=True)}
+        wider = {name: (one.low - share * scale[name], one.expression, one.high + share * scale[name])
+                 for name, one in self.terminal_constraints.items()}
+        with warnings.catch_warnings():  # of its kinks the problem itself has warned
+            warnings.simplefilter("ignore")
+            return replace(self, terminal_constraints=wider, scales={**self.scales, **scale})
+
     def at(self, p: Any = None) -> OCP:
         """The problem with its parameters folded in as constants: p as [np] or by name, each of them."""
         return self.folded(self.parameters_of(p, 1, f"OCP on {self.system.name!r}, at")[0])

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
-from nocl.judge import dynamics_function
+from nocl.judge.laws import dynamics_function
 from nocl.ocp import OCP, beside
 from nocl.support.checks import Array
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import nocl
+from nocl.comparisons import compare
 from nocl.solvers import DDP
 
 p, v, u = (ca.SX.sym(name) for name in "pvu")
@@ -134,3 +135,27 @@ def test_what_makes_no_sense_is_refused():
         nocl.simulate(ocp, ALWAYS, x0, horizon=2.0)
     with pytest.raises(ValueError, match=r"no nocl\.Free"):
         nocl.simulate(problem(horizon=2.0), ALWAYS, x0, horizon=2.0)
+
+
+def test_methods_are_compared_on_a_free_horizon():
+    ocp = problem(scales={"at p": 1.0, "at v": 1.0})
+    feedback = law(-ca.tanh((X[0] + X[1] * ca.fabs(X[1]) / 2) / 1e-4))
+    methods = {"law": feedback, "DDP": DDP(ocp), "never": ALWAYS}
+    report = compare(ocp, methods, n=3, seed=2, tolerance=1e-2)
+    own, plan, never = report.judged
+    assert own.simulation.success.all()
+    assert plan.simulation.success.all()
+    assert not never.simulation.reached.any()
+    x0 = report.x0
+    np.testing.assert_allclose(plan.simulation.cost, least_time(x0), rtol=2e-3)
+    assert (own.simulation.cost < plan.simulation.cost).all()  # it ends within the tolerance
+    assert plan.simulation.t.shape == (3, 81)
+    assert "Feedback ends as soon as" in str(report)
+    with pytest.raises(ValueError, match="takes a number as horizon"):
+        report.save("nowhere")
+
+
+def test_a_comparison_is_resumed_with_each_horizon(tmp_path):
+    ocp = problem()
+    first, again = (compare(ocp, {"DDP": DDP(ocp)}, n=2, seed=3, out=tmp_path) for _ in range(2))
+    np.testing.assert_array_equal(first.judged[0].simulation.t, again.judged[0].simulation.t)

@@ -11,7 +11,7 @@ import casadi as ca
 import numpy as np
 
 from nocl.constraints import END, Constraint
-from nocl.judge import Simulation
+from nocl.judge.runs import Simulation
 from nocl.ocp import OCP
 from nocl.support.checks import Array
 

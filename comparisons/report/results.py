@@ -23,7 +23,7 @@ from nocl.comparisons.report.findings import (
     per_cent,
     percentile,
 )
-from nocl.judge import Simulation
+from nocl.judge.runs import Simulation
 from nocl.ocp import OCP
 from nocl.scales import usual_sizes
 from nocl.support.checks import Array
@@ -313,6 +313,9 @@ def cells(row: Row, of: Sequence[tuple[str, str, str]] = COLUMNS) -> list[str]:
 def notes(report: Results) -> list[str]:
     """What the numbers of the summary are, in sentences."""
     n, c = int(report.counted.sum()), report.counted
+    if report.ocp.is_free:
+        return [*NOTE, "Feedback ends as soon as all terminal constraints hold within the tolerance, a share of "
+                f"{report.settings.get('tolerance', 0):g} of their scales; plans end where they hold exactly, and cost more."]
     if report.base is None:
         return [*NOTE]
     known = int((c & np.isfinite(report.base)).sum())

@@ -22,7 +22,7 @@ import numpy as np
 from nocl.comparisons.reproduce import table
 from nocl.comparisons.reproduce.dubins import INTERVALS, rollout_ms
 from nocl.comparisons.reproduce.table import Place
-from nocl.judge import simulate
+from nocl.judge.simulation import simulate
 from nocl.ocp import OCP
 from nocl.solvers.cnd.controller import pretrained
 from nocl.solvers.cnd.paper import PaperSettings

@@ -28,7 +28,7 @@ from nocl.comparisons.report.results import count
 from nocl.comparisons.studies import study
 from nocl.data import TINY
 from nocl.exports.bundle import export
-from nocl.judge import simulate
+from nocl.judge.simulation import simulate
 from nocl.ocp import OCP
 from nocl.scales import usual_sizes
 from nocl.solvers import registry

@@ -2,16 +2,8 @@
 
 from __future__ import annotations
 
-from nocl.judge.laws import (
-    answer_of,
-    check_made_for,
-    check_takes_p,
-    dynamics_function,
-    policy_function,
-    takes_p,
-)
-from nocl.judge.runs import AT_BOUND, Simulation
-from nocl.judge.simulation import simulate
+from nocl.support.lazy import hand_on
 
-__all__ = ["AT_BOUND", "Simulation", "answer_of", "check_made_for", "check_takes_p", "dynamics_function",
-           "policy_function", "simulate", "takes_p"]
+_LAZY = {"simulate": "nocl.judge.simulation", "Simulation": "nocl.judge.runs"}
+__all__ = list(_LAZY)
+__getattr__, __dir__ = hand_on(__name__, _LAZY)

@@ -23,7 +23,7 @@ from nocl import records
 from nocl.exports.bundle import export
 from nocl.exports.casadi_forms import to_casadi
 from nocl.exports.parity import Certificate, ExportPart
-from nocl.judge import dynamics_function
+from nocl.judge.laws import dynamics_function
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.cnd.features import at_rate, folded

@@ -7,10 +7,9 @@ label. Rounds of states that the law visits under pushes are solved too, as in t
 from __future__ import annotations
 
 import time
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Any
 
 import casadi as ca
@@ -20,7 +19,7 @@ from tqdm import tqdm
 
 from nocl.constraints import TOLERANCE
 from nocl.data import Solution
-from nocl.judge import simulate
+from nocl.judge.simulation import simulate
 from nocl.ocp import OCP
 from nocl.sampling import own_numbers
 from nocl.solvers.cnd.controller import CND
@@ -68,7 +67,7 @@ class LawTraining:
         self.hidden_progress = None if progress is None else not progress
         substeps = settings.substeps or substeps_for(ocp, None, settings.intervals, FINE)
         self.ddp = DDP(ocp, intervals=settings.intervals, substeps=substeps)
-        self.loose = DDP(loosened(ocp, TOLERANCE), intervals=4 * settings.intervals, substeps=-(-substeps // 4))
+        self.loose = DDP(ocp.loosened(TOLERANCE), intervals=4 * settings.intervals, substeps=-(-substeps // 4))
         self.in_torch = InTorch(ocp)
         self.round, self.seconds, self.history = 0, 0.0, list[dict[str, Any]]()
 
@@ -198,14 +197,3 @@ class LawTraining:
     def _stage(self, name: str, total: int) -> Iterator[tqdm[Any]]:
         with tqdm(total=total, desc=name, disable=self.hidden_progress, leave=True) as bar:
             yield bar
-
-
-def loosened(ocp: OCP, share: float) -> OCP:
-    """The problem of arriving within a share of each terminal constraint's scale."""
-    rows = ocp.functions.end_rows
-    scale = dict(zip(rows.names, ocp.functions.end_scales, strict=True))
-    wider = {name: (one.low - share * scale[name], one.expression, one.high + share * scale[name])
-             for name, one in ocp.terminal_constraints.items()}
-    with warnings.catch_warnings():  # of its kinks the problem itself has warned
-        warnings.simplefilter("ignore")
-        return replace(ocp, terminal_constraints=wider, scales={**ocp.scales, **scale})

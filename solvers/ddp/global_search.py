@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from tqdm import tqdm
 
 from nocl.data import Solution
-from nocl.judge import dynamics_function
+from nocl.judge.laws import dynamics_function
 from nocl.ocp import OCP
 from nocl.sampling import Seed
 from nocl.solvers.ddp.bank import SolutionBank

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 
 from nocl.data import Controller
-from nocl.judge import answer_of, takes_p
+from nocl.judge.laws import answer_of, takes_p
 from nocl.ocp import OCP
 from nocl.solvers.lqr import LQR
 from nocl.solvers.nmpc.transcription import Transcription

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nocl.data import Solution, Trajectory
-from nocl.judge import check_made_for, dynamics_function
+from nocl.judge.laws import check_made_for, dynamics_function
 from nocl.ocp import OCP
 from nocl.solvers.grid import fastest_at_start, followed, measured
 from nocl.solvers.lqr import LQR
