@@ -314,8 +314,9 @@ def notes(report: Results) -> list[str]:
     """What the numbers of the summary are, in sentences."""
     n, c = int(report.counted.sum()), report.counted
     if report.ocp.is_free:
+        share = report.settings.get("tolerance", 0)
         return [*NOTE, "Feedback ends as soon as all terminal constraints hold within the tolerance, a share of "
-                f"{report.settings.get('tolerance', 0):g} of their scales; plans end where they hold exactly, and cost more."]
+                f"{share:g} of their scales; plans end where they hold exactly, and cost more."]
     if report.base is None:
         return [*NOTE]
     known = int((c & np.isfinite(report.base)).sum())

@@ -265,8 +265,8 @@ def _train(args: argparse.Namespace) -> None:
     from nocl.cli.run_folder import RunFolder  # torch
 
     ocp, out = _problem(args)
-    ocp.refuse_free("nocl train")
     if not args.exact:
+        ocp.refuse_free("nocl train without --exact")
         _check_learnable(ocp)
     stages = RunFolder(ocp, out, args.seed, args.effort)
     stages.check(exact=args.exact)

@@ -270,7 +270,7 @@ def solve(ocp: OCP, out: Path, name: str, n: int, options: registry.Options, wor
     method = built(ocp, registry.METHODS[name], options)
     planned = is_plan(method)
     s, arrays, facts = _solved(ocp, method, starts, workers, checkpoint) if planned else _simulated(ocp, method, starts)
-    judged = _judged(ocp, starts, arrays) if planned and not ocp.is_free else {}  # no judge has a free horizon yet
+    judged = _judged(ocp, starts, arrays) if planned else {}
     if ocp.np:
         arrays["p"], facts["parameters"] = starts.p, list(ocp.parameter_names)
     if at:
@@ -301,7 +301,8 @@ def _judged(ocp: OCP, starts: Starts, arrays: dict[str, Any]) -> dict[str, Any]:
     cost, clearance, success = np.full(n, np.nan), np.full(n, np.nan), np.zeros(n, dtype=bool)
     message: list[str] = []
     if len(rows):
-        s = simulate(ocp, arrays["u"][rows], starts.x[rows], p=starts.p[rows])
+        horizon = arrays["t"][rows, -1] if ocp.is_free else None
+        s = simulate(ocp, arrays["u"][rows], starts.x[rows], p=starts.p[rows], horizon=horizon)
         cost[rows], clearance[rows], success[rows] = s.cost, s.clearance, s.success
         message = [f"{why} (state {i})" for i, why in zip(rows, s.message, strict=True) if why]
     return {"judged_cost": cost, "judged_clearance": clearance, "judged_success": success, "message": message}

@@ -44,7 +44,7 @@ class Labels:
     def __len__(self) -> int:
         return len(self.t)
 
-    def __getitem__(self, rows: slice) -> Labels:
+    def __getitem__(self, rows: slice | Rows | NDArray[np.bool_]) -> Labels:
         return Labels(*(getattr(self, name)[rows] for name in Labels.__dataclass_fields__))
 
     @staticmethod

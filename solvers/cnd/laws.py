@@ -6,15 +6,17 @@ label. Rounds of states that the law visits under pushes are solved too, as in t
 
 from __future__ import annotations
 
+import copy
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from nocl.constraints import TOLERANCE
@@ -36,6 +38,7 @@ from nocl.substeps import FINE
 from nocl.support.checks import Array
 from nocl.support.threads import one_thread
 
+AT_BOUND = 1e-3  # of the width of U: closer controls are at a bound
 LONGER = 1.5  # times the longest solution, that a law is followed for
 STEPS = 240  # of that
 KICKS = 4  # in it
@@ -58,12 +61,54 @@ def check_law(ocp: OCP, dynamics: Any, settings: TrainSettings) -> None:
                          "law's answers, simulate(..., hold=K)")
 
 
+@dataclass(frozen=True, eq=False)
+class Switches:
+    """Intervals of solutions in which one control goes from a bound to the other: what is held there, between the
+    bounds, stands for a switch on the way, before and after which a law is at the bounds."""
+
+    blurred: NDArray[np.bool_]  # [B K], intervals with such a control
+    share: Array  # [n], of the interval before the switch, for each of them with one such control alone
+    rows: NDArray[np.int64]  # [n], which these are
+    before: Array  # [n, nu]
+    after: Array  # [n, nu]
+
+    @staticmethod
+    def of(s: Solution, ocp: OCP) -> Switches:
+        low, high = ocp.system.lbu, ocp.system.ubu
+        u, near = s.u, AT_BOUND * (high - low)
+        first, last = np.concatenate([u[:, :1], u[:, :-1]], axis=1), np.concatenate([u[:, 1:], u[:, -1:]], axis=1)
+        at = [(v <= low + near, v >= high - near) for v in (first, u, last)]
+        between = ~(at[1][0] | at[1][1]) & (at[0][0] & at[2][1] | at[0][1] & at[2][0])
+        flat = between.reshape(-1, u.shape[2])
+        rows = np.flatnonzero(flat.sum(axis=1) == 1)
+        of = flat[rows]
+        held, first, last = (v.reshape(len(flat), -1)[rows] for v in (u, first, last))
+        share = (held - last)[of] / (first - last)[of]
+        return Switches(flat.any(axis=1), share, rows, np.where(of, first, held), np.where(of, last, held))
+
+    def labels(self, held: Labels, torch_ocp: InTorch) -> Labels:
+        """In the middle of the time before each switch, and of that after it; `held` are the intervals as they begin.
+        """
+        start = held[self.rows]
+        here, t = torch_ocp.at(start.p), torch.from_numpy(start.t)[:, None]
+        u, then = torch.from_numpy(self.before), torch.from_numpy(self.after)
+        h, part = torch.from_numpy(start.dt)[:, None], torch.from_numpy(self.share)[:, None]
+        with torch.no_grad():
+            x = torch.from_numpy(start.x)
+            early = here.after(x, u, t, part * h / 2)
+            late = here.after(here.after(x, u, t, part * h), then, t + part * h, (1 - part) * h / 2)
+        none = np.zeros(len(start))
+        return Labels.join([
+            replace(start, x=early.numpy(), u=self.before, weight=start.weight * self.share, dt=none),
+            replace(start, x=late.numpy(), u=self.after, weight=start.weight * (1 - self.share), dt=none)])
+
+
 class LawTraining:
-    """One run."""
+    """One run; without `switches` every interval is a label as any other."""
 
     def __init__(self, ocp: OCP, settings: TrainSettings, seed: int, progress: bool | None,
-                 own: ca.Function | None) -> None:
-        self.ocp, self.settings, self.seed, self.own = ocp, settings, seed, own
+                 own: ca.Function | None, switches: bool = True) -> None:
+        self.ocp, self.settings, self.seed, self.own, self.switches = ocp, settings, seed, own, switches
         self.hidden_progress = None if progress is None else not progress
         substeps = settings.substeps or substeps_for(ocp, None, settings.intervals, FINE)
         self.ddp = DDP(ocp, intervals=settings.intervals, substeps=substeps)
@@ -84,7 +129,9 @@ class LawTraining:
                 self._visit()
             self._regress(s.iterations * (2 if self.round >= max(s.least_rounds, 1) else 1))
             self._validate()
+            self._keep_best()
             self.round += 1
+        self.net.load_state_dict(self.weights)
         self.seconds = time.perf_counter() - begin
         return CND(self.ocp, self.net, None, self._card())
 
@@ -108,7 +155,11 @@ class LawTraining:
     def _labels(self, solution: Solution) -> Labels:
         """Of solutions that end on time: those of the least horizon wait for it."""
         s = solution[solution.success & (solution.t[:, -1] > self.ocp.horizon.low * (1 + 1e-3))]
-        return Labels.of(s, self.in_torch, self._unit(), self.ddp.substeps)
+        plain = Labels.of(s, self.in_torch, self._unit(), self.ddp.substeps)
+        if not self.switches:
+            return plain
+        where = Switches.of(s, self.ocp)
+        return Labels.join([plain[~where.blurred], where.labels(Labels.held(s, self._unit()), self.in_torch)])
 
     def _unit(self) -> float:
         return float(np.median(np.abs(self.bank.solution.cost)))
@@ -173,22 +224,28 @@ class LawTraining:
             fresh = Problems.initial(self.ocp, s.held_out, rng)
             best = self.bank.solve(self.loose, fresh.x, fresh.p, 4)
             run = simulate(self.ocp, CND(self.ocp, self.net, None, {}), fresh.x, p=fresh.given_p)
-            gap = np.where(run.success, run.cost, np.inf) / np.where(best.success, best.cost, np.nan) - 1
-            known = gap[best.success]
-            self.net.double()
+            gap = np.where(run.success, run.cost, np.inf)[best.success] / best.cost[best.success] - 1
             bar.update()
         self.history.append({"round": self.round, "labels": len(self.labels), "unsolved": int((~best.success).sum()),
-                             "arrived": float(run.reached.mean()), **summary(known, "gap")})
-        bar.set_postfix_str(str(self.history[-1]))
+                             "arrived": float(run.reached.mean()), **summary(gap, "gap")})
+
+    def _keep_best(self) -> None:
+        """Of the rounds the best law: where it switches, a fit is a little better or worse than the last one."""
+        last = self.history[-1]
+        if last is self._best():
+            self.weights = copy.deepcopy(self.net.state_dict())
+
+    def _best(self) -> dict[str, Any]:
+        return min(self.history, key=lambda row: (-row["arrived"], row["gap_p95"], row["gap_median"]))
 
     def _good_enough(self) -> bool:
         if self.round <= self.settings.least_rounds:
             return False
-        last, s = self.history[-1], self.settings
+        last, s = self._best(), self.settings
         return bool(last["gap_median"] <= s.gap_median and last["gap_p95"] <= s.gap_p95)
 
     def _card(self) -> dict[str, Any]:
-        last = self.history[-1]
+        last = self._best()
         return {"method": "default", "dynamics": "exact", "seed": self.seed, "seconds": round(self.seconds, 1),
                 **{name: last[name] for name in ("gap_median", "gap_p95", "arrived", "unsolved")},
                 "settings": asdict(self.settings), "history": self.history}

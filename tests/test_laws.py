@@ -1,0 +1,97 @@
+"""Laws u(x) of problems whose horizon is free: the bank of nodes, training, files, what is refused."""
+
+from __future__ import annotations
+
+import casadi as ca
+import numpy as np
+import pytest
+
+import nocl
+from nocl.solvers import DDP
+from nocl.solvers.cnd.settings import TrainSettings
+from nocl.solvers.ddp.global_search import solve_globally
+from nocl.solvers.ddp.nodes import NodeBank
+
+p, v, u = (ca.SX.sym(name) for name in "pvu")
+SYSTEM = nocl.System("integrator", x=ca.vertcat(p, v), u=u, xdot=ca.vertcat(v, u), lbu=[-1], ubu=[1], lbx=[-5, -5],
+                     ubx=[5, 5])
+STATES = nocl.Uniform([-2, -1], [2, 1])
+
+
+def problem(**options):
+    given = {"horizon": nocl.Free(0.05, 10), "running": 1.0, "terminal": 0.0, "x_goal": [0, 0], "u_goal": [0],
+             "initial_states": STATES, "terminal_constraints": {"at p": (0, p, 0), "at v": (0, v, 0)},
+             "scales": {"at p": 1.0, "at v": 1.0}, **options}
+    return nocl.OCP(SYSTEM, **given)
+
+
+def least_time(x):
+    side = np.sign(x[:, 0] + x[:, 1] * np.abs(x[:, 1]) / 2)
+    p, v = side * x[:, 0], side * x[:, 1]
+    return v + 2 * np.sqrt(p + v**2 / 2)
+
+
+@pytest.fixture(scope="module")
+def bank():
+    ocp = problem()
+    return NodeBank(ocp, solve_globally(DDP(ocp), STATES.sample(12, 0), starts=4, seed=0, progress=False))
+
+
+def test_what_is_left_of_a_solution_is_one(bank):
+    rows, nodes = np.array([0, 3, 7]), np.array([10, 40, 60])
+    guess, s = bank.tails(rows, nodes, 80), bank.solution
+    np.testing.assert_allclose(guess["x"][:, 0], s.x[rows, nodes], atol=1e-12)
+    np.testing.assert_allclose(guess["t"][:, -1], s.t[rows, -1] - s.t[rows, nodes], rtol=1e-9)
+    again = DDP(bank.ocp).solve(s.x[rows, nodes], **guess)
+    assert again.success.all()
+    np.testing.assert_allclose(again.cost, least_time(s.x[rows, nodes]), rtol=5e-3)
+    np.testing.assert_allclose(again.cost, guess["t"][:, -1], rtol=5e-3)
+
+
+def test_tails_keep_their_controls_on_any_grid(bank):
+    rows, nodes = np.array([1, 2]), np.array([0, 0])
+    fine = bank.tails(rows, nodes, 320)
+    np.testing.assert_array_equal(fine["u"], np.repeat(bank.solution.u[rows], 4, axis=1))
+    np.testing.assert_allclose(fine["x"][:, ::4], bank.solution.x[rows], atol=1e-12)
+
+
+def test_the_nearest_node_is_a_start(bank):
+    fresh = STATES.sample(20, 5)
+    found = bank.solve(DDP(bank.ocp), fresh, np.zeros((20, 0)), 3)
+    assert found.success.mean() >= 0.95
+    np.testing.assert_allclose(found.cost[found.success], least_time(fresh[found.success]), rtol=5e-3)
+
+
+def test_a_loosened_end_is_reached_sooner():
+    x0 = STATES.sample(3, 1)
+    loose = DDP(problem().loosened(1e-2)).solve(x0)
+    assert loose.success.all()
+    ends = loose.x[:, -1]
+    assert (np.abs(ends) <= 1e-2 * (1 + 1e-6)).all()
+    assert (loose.cost < least_time(x0)).all()
+    assert (loose.cost + least_time(ends) >= least_time(x0)).all()  # the triangle inequality
+
+
+@pytest.mark.slow
+def test_a_minimum_time_law_takes_nearly_the_least_time(tmp_path):
+    ocp = problem()
+    settings = TrainSettings.of("quick", iterations=1000, rounds=2, states=100, tails=200)
+    cnd = nocl.train(ocp, settings=settings, seed=0, progress=False)
+    fresh = STATES.sample(20, 9)
+    run = nocl.simulate(ocp, cnd, fresh)
+    assert run.success.all()
+    over = run.cost / least_time(fresh) - 1
+    assert np.median(over) < 0.01
+    assert cnd.card["arrived"] == 1.0
+    again = nocl.CND.load(cnd.save(tmp_path))
+    np.testing.assert_array_equal(again(fresh), cnd(fresh))
+    np.testing.assert_allclose(cnd.to_casadi()(fresh.T, 0.0).full().T, cnd(fresh), atol=1e-12)
+
+
+def test_what_no_law_can_be_had_of_is_refused():
+    with pytest.raises(ValueError, match=r"holds the time, so that no u\(x\)"):
+        nocl.train(problem(running=1 + 0.1 * nocl.time() * u**2))
+    with pytest.raises(ValueError, match="no terminal constraints"):
+        nocl.train(problem(terminal_constraints={}, scales={}))
+    with pytest.raises(ValueError, match="control_dt"):
+        nocl.train(problem(), settings=TrainSettings.of("quick", control_dt=True))
