@@ -42,7 +42,7 @@ def test_a_run_ends_where_its_terminal_constraint_holds():
     x0 = np.array([[0.0, -0.5], [1.0, 0.25], [0.3, 0.99]])
     run = nocl.simulate(ocp, ALWAYS, x0, tolerance=1e-2)
     assert run.success.all()
-    np.testing.assert_allclose(run.t[:2, -1], 1 - x0[:2, 1] - 0.02 * 0.999, rtol=1e-7)
+    np.testing.assert_allclose(run.t[:2, -1], 1 - x0[:2, 1] - 0.02 * 0.95, rtol=1e-7)
     assert run.t[2, -1] == 0.05  # it has arrived before the least horizon
     np.testing.assert_allclose(run.x[:, -1, 1], x0[:, 1] + run.t[:, -1], atol=1e-8)
     np.testing.assert_allclose(run.cost, run.t[:, -1], rtol=1e-9)
@@ -53,7 +53,7 @@ def test_a_run_that_only_passes_through_is_seen(speed):
     ocp = problem(terminal_constraints={"at p": (0.5, p, 0.5)}, scales={"at p": 1.0})
     for tolerance in (1e-3, 1e-6):
         run = nocl.simulate(ocp, law(ca.MX(0.0)), [[0.0, speed]], tolerance=tolerance)
-        assert run.t[0, -1] == pytest.approx((0.5 - tolerance) / speed, abs=2e-5 / speed)
+        assert run.t[0, -1] == pytest.approx((0.5 - 0.95 * tolerance) / speed, abs=2e-5 / speed)
 
 
 def test_time_optimal_feedback_takes_the_analytic_time():

@@ -8,6 +8,9 @@ import pytest
 
 import nocl
 from nocl.solvers import DDP
+from nocl.solvers.cnd.in_torch import InTorch
+from nocl.solvers.cnd.labels import Labels
+from nocl.solvers.cnd.laws import Switches
 from nocl.solvers.cnd.settings import TrainSettings
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.nodes import NodeBank
@@ -70,6 +73,28 @@ def test_a_loosened_end_is_reached_sooner():
     assert (np.abs(ends) <= 1e-2 * (1 + 1e-6)).all()
     assert (loose.cost < least_time(x0)).all()
     assert (loose.cost + least_time(ends) >= least_time(x0)).all()  # the triangle inequality
+
+
+def test_labels_stand_on_their_side_of_the_switch(bank):
+    """Of the analytic law, u = -sign(p + v |v| / 2): the switch falls within an interval, where a control between the
+    bounds is held."""
+    s, ocp = bank.solution, bank.ocp
+    where, held = Switches.of(s, ocp), Labels.held(s, 1.0)
+    assert where.blurred.sum() >= 0.8 * len(s)
+    assert len(where.rows) == where.blurred.sum()  # there is one control
+    assert (np.abs(held.u[where.blurred]) < 1 - 1e-3).all()
+    found = where.labels(held, InTorch(ocp))
+    side = found.x[:, 0] + found.x[:, 1] * np.abs(found.x[:, 1]) / 2
+    clear = np.abs(side) > 1e-4
+    assert clear[:len(where.rows)].all()  # those after the switch go down the curve itself
+    np.testing.assert_array_equal(found.u[clear, 0], -np.sign(side[clear]))
+    np.testing.assert_allclose(found.weight.sum(), held.weight[where.rows].sum())
+
+
+def test_parts_of_an_interval_add_up_to_what_was_held(bank):
+    where, held = Switches.of(bank.solution, bank.ocp), Labels.held(bank.solution, 1.0)
+    mean = where.share[:, None] * where.before + (1 - where.share[:, None]) * where.after
+    np.testing.assert_allclose(mean, held.u[where.rows], atol=1e-9)
 
 
 @pytest.mark.slow

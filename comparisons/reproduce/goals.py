@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -176,6 +176,7 @@ class Cell:
     identify: float  # s of learning f(x, u, p); 0 on the exact f
     seconds: float  # of training, wall-clock
     cpu: float  # the same in seconds of CPU time
+    failed: list[str] = field(default_factory=list)  # what the judge says of runs that failed
 
     @property
     def place(self) -> Place:
@@ -221,9 +222,10 @@ class Goals(table.PaperTable[Plan, Cell, Entry]):
         shown = FEATURES[place.problem](ocp) if place.problem in FEATURES else None
         cnd = train(ocp, model, seed=place.seed, settings=settings, progress=False, features=shown)
         seconds, cpu = time.perf_counter() - start, time.process_time() - cpu
-        gap, collisions = judged(place.problem, cnd, plan.n, place.seed)
+        cnd.save(self.path(folder, place).with_suffix(""))
+        gap, collisions, failed = judged(place.problem, cnd, plan.n, place.seed)
         return Cell(place.problem, place.way, place.seed, self.key(plan, place), gap.tolist(), collisions, identified,
-                    seconds, cpu)
+                    seconds, cpu, failed)
 
     def entries(self, cells: Sequence[Cell]) -> list[Entry]:
         groups = [(problem, way, [c for c in cells if (c.problem, c.way) == (problem, way)])
@@ -263,16 +265,20 @@ class Goals(table.PaperTable[Plan, Cell, Entry]):
         return {"": figure}
 
 
-def judged(problem: str, cnd: Any, n: int, seed: int) -> tuple[Array, int]:
-    """(gap of each fresh (x0, p), collisions) to the best of `optima` and of what the controller's runs lead to; inf
-    where the run failed, NaN where it did not and no plan was found that holds the constraints."""
+def judged(problem: str, cnd: Any, n: int, seed: int) -> tuple[Array, int, list[str]]:
+    """(gap of each fresh (x0, p), collisions, why runs failed).
+
+    Gaps are to the best of `optima` and of what the controller's runs lead to; inf where the run failed, NaN where it
+    did not and no plan was found that holds the constraints.
+    """
     ocp = PROBLEMS[problem][1]()
     x0, p = drawn(ocp, n, seed)
     own, reference = with_reference(compare(ocp, {"CND": cnd}, x0=x0, p=p, progress=False), FINE).judged
     best = np.minimum(optima(problem, n, seed), _held(reference))
     cost, known = own.simulation.cost, np.isfinite(best)
     gap = np.divide(cost - best, np.abs(best), out=np.full(len(best), np.nan), where=known)
-    return np.where(own.simulation.success, gap, np.inf), int((own.simulation.violation > 0).sum())
+    run = own.simulation
+    return np.where(run.success, gap, np.inf), int((run.violation > 0).sum()), [why for why in run.message if why]
 
 
 @lru_cache(maxsize=1)  # the ways of a problem come one after the other
