@@ -559,16 +559,13 @@ class OCP:
         goal = self.goals(np.atleast_2d(rows))[0]
         return goal[0] if rows.ndim == 1 else beside(goal, axes)
 
-    def check_strict(self, owner: str) -> None:
-        """ValueError where the Hamiltonian is linear in a control, so that second derivatives say nothing of it."""
-        if self.system.xdot is None:
-            return  # the equations are learned: nothing is known of them yet
-        names = linear_controls(self.running, self.system.xdot, self.system.u)
-        if names:
-            raise ValueError(f"{owner}: cost and dynamics are linear in {', '.join(names)}: the optimum jumps between "
-                             "bounds (bang-bang), which no smooth controller has; expected a cost that curves in each "
-                             "control: add a small quadratic term, a thousandth of the usual running cost times "
-                             f"(({names[0]} - its goal) / its range)**2, or solve state by state with NMPC")
+    @cached_property
+    def flat_controls(self) -> tuple[str, ...]:
+        """The controls that the Hamiltonian is linear in, piece by piece where L has kinks: their optimum jumps between
+        bounds (bang-bang), or is singular. Where f is not known, those that L is linear in.
+        """
+        s = self.system
+        return tuple(linear_controls(self.running, ca.SX(0, 1) if s.xdot is None else s.xdot, s.u))
 
     @classmethod
     def quadratic(cls, system: System, *, x_goal: Vector, u_goal: Vector, R: Vector = 0.01, P: Vector = 1.0,

@@ -33,6 +33,7 @@ from nocl.solvers.ddp.batch import Job, Piece, assembled, pieces
 from nocl.solvers.ddp.constraints import ConstraintRows, rows_of
 from nocl.solvers.ddp.free import FreeTime, lifted, with_horizons
 from nocl.solvers.ddp.kernel import ddp_source, pack_weights
+from nocl.solvers.ddp.smoothing import continued, in_own_cost, regularised, weights_for, with_weight
 from nocl.solvers.ddp.without_compiler import ddp_kernel
 from nocl.solvers.ddp.work import CONVERGED, GROWTH, DDPSettings, Work
 from nocl.solvers.grid import fastest_at_start, firsts, followed, measured
@@ -75,6 +76,9 @@ class DDP:
         In place of the problem's own constraints.
     cache : folder for compiled kernels, optional
         Default: the folder that NOCL_CACHE names, or else one that goes with the process.
+
+    Controls that the Hamiltonian is linear in (`OCP.flat_controls`) are solved with a small quadratic term
+    (nocl/solvers/ddp/smoothing.py) where the horizon is a number; costs are those of the problem without it.
     """
 
     def __init__(self, ocp: OCP, *, intervals: int = 80, substeps: int | None = None,
@@ -93,7 +97,8 @@ class DDP:
         if settings is not None:
             checks.instance(DDPSettings, settings, "settings", "DDP", "DDPSettings(max_iterations=...)")
         self.ocp, self.intervals, self.settings = ocp, int(intervals), settings or DDPSettings()
-        self.posed = lifted(ocp) if ocp.is_free else ocp  # what the kernel solves
+        self.smoothed = bool(ocp.flat_controls) and not ocp.is_free
+        self.posed = _posed(ocp, self.smoothed)  # what the kernel solves
         self.constraints, self.dynamics, self.cache = constraints, dynamics, cache
         self.between = None if between is None else checks.flag(between, "between", "DDP")
         self.margin: Array | None = None  # see `inside`
@@ -111,6 +116,13 @@ class DDP:
         self.kernel = ddp_kernel(self.posed, dynamics, cache, self.substeps, self._multiplied)
         self._lb, self._ub = np.ascontiguousarray(ocp.system.lbu), np.ascontiguousarray(ocp.system.ubu)
 
+    @cached_property
+    def weights(self) -> tuple[float, ...]:
+        """Of the quadratic term in flat controls, those that solutions are continued through."""
+        x0, p = firsts(self.ocp)
+        few = Piece("few", 0, x0, np.zeros(len(x0)), {}, False, p)
+        return weights_for(self.ocp, self.posed, self._descended, few)
+
     @property
     def _multiplied(self) -> ConstraintRows | None:
         """The rows that multipliers hold, none or not; None where the kernel knows of no such rows."""
@@ -122,12 +134,13 @@ class DDP:
                              "expected the constraints of its problem: leave `rows` out, or use workers of this one")
         return {"ocp": self.ocp, "intervals": self.intervals, "substeps": self.substeps, "dynamics": self.dynamics,
                 "settings": self.settings, "constraints": self.constraints, "between": self.between,
-                "threads": self.threads, "cache": self.cache, "margin": self.margin}
+                "threads": self.threads, "cache": self.cache, "margin": self.margin,
+                **({"weights": self.weights} if self.smoothed else {})}
 
     def __setstate__(self, options: dict[str, Any]) -> None:
-        margin = options.pop("margin")
+        found = {name: options.pop(name) for name in ("margin", "weights") if name in options}
         DDP.__init__(self, **options)  # the kernel is built, or found in the cache, where it is needed
-        self.margin = margin
+        self.__dict__.update(found)
 
     def inside(self, margin: Array) -> DDP:
         """The same solver, which holds each row further inside, by a share of its scale [rows of a stage, then of the
@@ -184,7 +197,14 @@ class DDP:
 
     def descend(self, batch: Piece) -> Solution:
         """Solve one piece of a batch, here."""
-        work = self._work(batch.x0, batch.t0, batch.guess, batch.p)
+        if self.smoothed:
+            found = continued(self._descended, batch, self.weights)
+            return in_own_cost(self.ocp, self.posed, found, self.weights[-1])
+        return self._descended(batch)
+
+    def _descended(self, batch: Piece, weight: float | None = None) -> Solution:
+        """A piece solved; weight : of the quadratic term, where there is one; default: the last."""
+        work = self._work(batch.x0, batch.t0, batch.guess, batch.p, weight)
         work.descend()
         if not (self.between and isinstance(work, Augmented)):
             return work.solution(batch.curvature)
@@ -240,7 +260,8 @@ class DDP:
             return known
         T, free = known.t[:, -1], self.ocp.is_free
         t, x = (known.t / T[:, None], with_horizons(known.x, T)) if free else (known.t, known.x)
-        return replace(known, cut=known.success & self._dips.cut(t, x, known.u, known.parameters))
+        p = with_weight(known.p, len(known), self.weights[-1]) if self.smoothed else known.parameters
+        return replace(known, cut=known.success & self._dips.cut(t, x, known.u, p))
 
     def rollout(self, x0: Array, p: Array | None = None, **guess: Array) -> Array:
         """The states [B, K+1, nx] from x0 [B, nx] at t0 = 0 under a guess of `solve`'s: where the descent begins.
@@ -265,8 +286,10 @@ class DDP:
             rows = rows[work.mu[rows] <= s.largest_damping]
         return work.gain[..., :x.shape[2]]
 
-    def _work(self, x0: Array, t0: Array, guess: dict[str, Array], p: Array | None) -> Work:
+    def _work(self, x0: Array, t0: Array, guess: dict[str, Array], p: Array | None,
+              weight: float | None = None) -> Work:
         u, x, gain = (guess.get(name) for name in ("u", "x", "gain"))
+        p = with_weight(p, len(x0), weight or self.weights[-1]) if self.smoothed else p
         if not self.ocp.is_free:
             return (Augmented if self.held else Work)(self, x0, t0, u, x, gain, p)
         T = guess["t"][:, -1] if "t" in guess else np.full(len(x0), middle(self.ocp.horizon))
@@ -335,6 +358,13 @@ class DDP:
             raise ValueError(f"t0 is {checks.shown(times)}, but the horizon is free; expected 0: the time that is left "
                              "is found from there")
         return times
+
+
+def _posed(ocp: OCP, smoothed: bool) -> OCP:
+    """The problem as the kernel solves it."""
+    if ocp.is_free:
+        return lifted(ocp)
+    return regularised(ocp) if smoothed else ocp
 
 
 @lru_cache(maxsize=32)
