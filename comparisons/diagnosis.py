@@ -87,8 +87,11 @@ def doctor(ocp: OCP, intervals: int = 80, seed: int = 0) -> Diagnosis:
 
 
 def _definition(ocp: OCP) -> Iterator[Finding]:
-    yield _goal(ocp)
-    yield _control(ocp)
+    if ocp.has_goal:
+        yield _goal(ocp)
+        yield _control(ocp)
+    else:
+        yield Finding("goal", OK, "none: what is not about one, controllability there, is left out")
     yield _convexity(ocp)
     if ocp.kinks:
         yield Finding("smoothness", REMARK, ocp.not_smooth)

@@ -223,8 +223,8 @@ class Training:
 
     def _second_opinion(self, seeds: Solution) -> Solution:
         """The seeds, better ones where NMPC knows some, and then all of them solved from these: where a quadratic term
-        was added."""
-        if not self.ddp.smoothed:
+        was added, or no goal says where to look for optima."""
+        if self.ocp.has_goal and not self.ddp.smoothed:
             return seeds
         said = second_opinion(self.ddp, seeds)
         self.opinion = said.card

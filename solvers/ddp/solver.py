@@ -15,7 +15,7 @@ import sys
 import warnings
 from collections import Counter
 from dataclasses import replace
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -37,7 +37,7 @@ from nocl.solvers.ddp.smoothing import continued, in_own_cost, regularised, weig
 from nocl.solvers.ddp.without_compiler import ddp_kernel
 from nocl.solvers.ddp.work import CONVERGED, GROWTH, DDPSettings, Work
 from nocl.solvers.grid import fastest_at_start, firsts, followed, measured
-from nocl.solvers.starts import middle
+from nocl.solvers.starts import middle, random_start
 from nocl.substeps import COARSE, Grid, settled
 from nocl.support import checks
 from nocl.support.checks import Array
@@ -46,6 +46,9 @@ from nocl.support.pool import Journal, Pool, stream
 
 if TYPE_CHECKING:
     from nocl.sysid.identification import LearnedDynamics
+
+
+FIRST, FEW = 4, 12  # substeps, and starts of each state, by which it is found out how fast a plant without a goal gets
 
 
 class DDP:
@@ -374,14 +377,32 @@ def substeps_for(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int, tol
     tried = ocp if ocp.states_only or free else ocp.unconstrained  # a few descents, to see how fast the plant is
     functions, (x0, p) = _functions(tried, dynamics), firsts(ocp)
 
-    def ask(substeps: int) -> Grid | None:
+    def solved(substeps: int) -> Solution:
         ddp = DDP(tried, intervals=intervals, substeps=substeps, dynamics=dynamics,
                   constraints="hard" if free else "soft")
         ddp.checked = True
-        return measured(tried, functions, ddp.solve(x0, p=p, progress=False), substeps)
+        return ddp.solve(x0, p=p, progress=False) if ocp.has_goal else _best_of_few(ddp, x0, p)
+
+    def ask(substeps: int) -> Grid | None:
+        found = solved(substeps) if ocp.has_goal else fine()
+        return measured(tried, functions, found, substeps)
+
+    @cache
+    def fine() -> Solution:
+        """Without a goal optima may be where a coarse grid has none: those of a fine one are asked about."""
+        return solved(FIRST)
 
     step = (middle(ocp.horizon) if free else ocp.horizon) / intervals
     return settled(f"DDP of {ocp.system.name}", ask, step, lambda: fastest_at_start(ocp, functions), tolerance)
+
+
+def _best_of_few(ddp: DDP, x0: Array, p: Array) -> Solution:
+    """The best of FEW starts of each state, of a problem without a goal."""
+    B, rng = len(x0), np.random.default_rng(0)
+    u = np.concatenate([random_start(ddp.ocp, ddp.intervals, B, rng, number, p) for number in range(FEW)])
+    found = ddp.solve(np.tile(x0, (FEW, 1)), u=u, p=np.tile(p, (FEW, 1)) if ddp.ocp.np else None, progress=False)
+    best = found.cost.reshape(FEW, B).argmin(axis=0)
+    return found[best * B + np.arange(B)]
 
 
 def _functions(ocp: OCP, dynamics: LearnedDynamics | None) -> Functions:
