@@ -142,8 +142,8 @@ def _convexity(ocp: OCP) -> Finding:
     if not ocp.flat_controls:
         return Finding("convexity", OK, "the cost curves in every control")
     return Finding("convexity", REMARK, f"cost and dynamics are linear in {', '.join(ocp.flat_controls)}: the optimum "
-                   "jumps between bounds (bang-bang), or is singular. DDP and training add a small quadratic term there "
-                   "and lower it; training's card says what it costs")
+                   "jumps between bounds (bang-bang), or is singular. DDP and training add a small quadratic term "
+                   "there, and lower it; training's card says what it costs")
 
 
 # Solutions

@@ -806,7 +806,8 @@ class OCP:
             constraints = ca.vertsplit(read(data["h"], at)) if data["path_constraints"] else []
             goal = instructions.from_data(data["goal"], [every])(every) if "goal" in data else \
                 (data["x_goal"], data["u_goal"])
-            goal = [None if data[name] is None else value for name, value in zip(("x_goal", "u_goal"), goal, strict=True)]
+            goal = [None if data[name] is None else value
+                    for name, value in zip(("x_goal", "u_goal"), goal, strict=True)]
             horizon = data["horizon"]
             more = {kind: _constraints_from(data[kind], at) for kind in ("constraints", "terminal_constraints")
                     if kind in data}

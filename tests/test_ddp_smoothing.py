@@ -53,8 +53,7 @@ def test_bang_bang_and_singular_arcs_cost_what_ipopt_finds(running):
     assert ours.p is None
     np.testing.assert_allclose(ours.cost, costs_of(ocp, ours), rtol=1e-5)
     np.testing.assert_allclose(ours.V[:, 0], ours.cost, rtol=1e-9)
-    np.testing.assert_allclose(ours.V[:, -1], ca.Function("G", [ocp.system.x], [ocp.terminal])(ours.x[:, -1].T).full()[0],
-                               rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(ours.V[:, -1], ocp.G(ours.x[:, -1].T).full()[0], rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.filterwarnings("ignore:.*has a kink")
@@ -102,9 +101,9 @@ def test_the_term_is_in_flat_controls_alone():
     assert ocp.flat_controls == ("other",)
     posed = regularised(ocp)
     weight = posed.p
-    more = ca.Function("more", [system.u, weight], [posed.running - ocp.running])
+    more = ca.Function("more", [system.x, system.u, weight], [posed.running - ocp.running])
     at = np.array([[0.3, 0], [0.3, 4], [0.9, 2], [-0.9, 2]]).T
-    low, high, middle, other_u = more(at, 0.5).full()[0]
+    low, high, middle, other_u = more(0.0, at, 0.5).full()[0]
     assert low == high > 0  # it costs the same at both bounds
     assert middle == other_u == pytest.approx(0.0, abs=1e-15)
 

@@ -96,7 +96,8 @@ def test_flat_controls_are_those_of_the_hamiltonian():
         assert problem(ca.fabs(u)).flat_controls == ("u",)  # piece by piece
 
 
-@pytest.mark.parametrize("e", [ca.fabs(u - p / 2), ca.fmax(u, p), ca.fmin(3 * u, 1 - p), ca.fmax(ca.fabs(u), ca.fabs(p))])
+@pytest.mark.parametrize("e", [ca.fabs(u - p / 2), ca.fmax(u, p), ca.fmin(3 * u, 1 - p),
+                               ca.fmax(ca.fabs(u), ca.fabs(p))])
 def test_kinks_in_the_controls_are_rounded_off(e):
     width = 1e-3
     smooth = rounded(e, z, u, width, *BOX)

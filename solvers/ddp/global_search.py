@@ -3,7 +3,7 @@
 These are u*, the goal held by feedback, and then by turns smooth random controls and, what found most on cart-poles
 from anywhere (docs/ddp.md), smooth random controls under the feedback that holds an equilibrium, from a random time on:
 a pole that can be caught is, which no open-loop control of an unstable system stumbles on. A problem without a goal has
-none to hold, but equilibria, and by turns random controls that are smooth and that are held over a few parts of the time.
+none to hold, but equilibria, and its random controls are by turns smooth and held over a few parts of the time.
 """
 
 from __future__ import annotations

@@ -21,7 +21,8 @@ from nocl.solvers.ddp.solver import DDP
 from nocl.solvers.nmpc.solver import NMPC
 from nocl.support.checks import Array
 
-STATES, STARTS = 3, 3  # that are asked for, and NMPC's own starts of each, beside DDP's plan
+STATES, STARTS = 2, 2  # that are asked for, and NMPC's own starts of each, beside DDP's plan
+PATIENCE = 20.0  # seconds for each start of NMPC's
 SMALL = 1e-3  # of a usual cost: costs are not divided by less
 AGREE = 1e-2  # of the cost: methods that differ by more disagree
 
@@ -78,8 +79,9 @@ def second_opinion(ddp: DDP, plans: Solution, states: int = STATES, starts: int 
 
 def _nmpc(ddp: DDP, some: Solution, starts: int) -> Solution:
     """The best of NMPC from DDP's plans and from starts of its own, on DDP's grid."""
+    held = "soft" if ddp.constraints == "soft" else "hard"
     nmpc = NMPC(without_kinks(ddp.ocp), ddp.intervals, dynamics=ddp.dynamics, substeps=ddp.substeps, passes=0,
-                constraints="soft" if ddp.constraints == "soft" else "hard", between=bool(ddp.between))
+                constraints=held, between=bool(ddp.between), time_limit=PATIENCE)
     with warnings.catch_warnings():  # of the grid DDP has told
         warnings.simplefilter("ignore")
         return nmpc.solve(some.x[:, 0], [some], p=some.p, starts=starts, workers=1, progress=False)

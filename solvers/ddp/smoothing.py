@@ -132,7 +132,8 @@ def continued(solve: Callable[[Piece, float], Solution], batch: Piece, weights: 
 
 
 def _part(batch: Piece, rows: Rows, guess: dict[str, Array]) -> Piece:
-    return replace(batch, x0=batch.x0[rows], t0=batch.t0[rows], guess=guess, p=None if batch.p is None else batch.p[rows])
+    p = None if batch.p is None else batch.p[rows]
+    return replace(batch, x0=batch.x0[rows], t0=batch.t0[rows], guess=guess, p=p)
 
 
 def _plans(s: Solution, rows: Rows) -> dict[str, Array]:
