@@ -9,11 +9,12 @@ import pytest
 
 import nocl
 from nocl.solvers import DDP, NMPC
+from nocl.solvers.cnd.settings import TrainSettings
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.opinion import second_opinion
 from nocl.solvers.ddp.smoothing import regularised, without_kinks
 
-P, V, U, A = (ca.SX.sym(name) for name in ("pos", "v", "force", "w"))
+P, V, U = (ca.SX.sym(name) for name in ("pos", "v", "force"))
 T, K = 4.0, 40
 
 
@@ -149,3 +150,14 @@ def test_the_second_opinion_mends_a_plan():
     assert said.apart == pytest.approx(0.15, abs=0.01)
     assert "two methods disagree by 15 % here" in said.text
     assert said.solution.cost[0] == pytest.approx(s.cost[0], rel=1e-6)
+
+
+@pytest.mark.slow
+def test_training_takes_a_problem_without_a_cost_on_the_control():
+    settings = TrainSettings(intervals=K, seeds=3, starts=3, states=20, tails=150, visits=50, rounds=0, iterations=300,
+                             hidden=(24, 24), value=False, held_out=8)
+    card = nocl.train(cart(P**2 + V**2), settings=settings, seed=0, progress=False).card
+    assert card["second_opinion"]["controls"] == ["force"]
+    assert 0 <= card["second_opinion"]["price"] < 1e-3
+    assert "it costs" in card["second_opinion"]["text"]
+    assert card["gap_median"] < 0.02  # to the optimum in the problem's own cost

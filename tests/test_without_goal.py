@@ -12,6 +12,7 @@ from nocl.comparisons import compare
 from nocl.comparisons.diagnosis import doctor
 from nocl.ocp import OCP
 from nocl.solvers import DDP, LQR, NMPC
+from nocl.solvers.cnd.settings import TrainSettings
 from nocl.solvers.ddp.global_search import GlobalDDP, solve_globally
 from nocl.solvers.starts import levels
 
@@ -92,3 +93,13 @@ def test_levels_are_held_and_reach_the_bounds():
     at_bound = ((u == 0) | (u == 1)).mean()
     assert 0.4 < at_bound < 0.6
     assert (levels(system, 7, 3, np.random.default_rng(0), 1).std(axis=1) == 0).all()
+
+
+@pytest.mark.slow
+def test_training_without_one_asks_for_a_second_opinion():
+    settings = TrainSettings(intervals=20, seeds=3, starts=4, states=20, tails=100, visits=50, rounds=0, iterations=200,
+                             hidden=(16, 16), value=False, held_out=8)
+    card = nocl.train(fishery(), settings=settings, seed=0, progress=False).card
+    assert card["second_opinion"]["states"] == 2
+    assert card["second_opinion"]["text"] == ""  # both methods agree, and no term was added
+    assert card["gap_median"] < 0.02
