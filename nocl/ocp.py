@@ -806,13 +806,13 @@ class OCP:
             constraints = ca.vertsplit(read(data["h"], at)) if data["path_constraints"] else []
             goal = instructions.from_data(data["goal"], [every])(every) if "goal" in data else \
                 (data["x_goal"], data["u_goal"])
-            goal = [None if data[name] is None else value
-                    for name, value in zip(("x_goal", "u_goal"), goal, strict=True)]
+            x_goal, u_goal = (None if data[name] is None else value
+                              for name, value in zip(("x_goal", "u_goal"), goal, strict=True))
             horizon = data["horizon"]
             more = {kind: _constraints_from(data[kind], at) for kind in ("constraints", "terminal_constraints")
                     if kind in data}
             horizon = Free(*horizon["free"]) if isinstance(horizon, Mapping) else horizon
-            return OCP(system, horizon=horizon, x_goal=goal[0], u_goal=goal[1],
+            return OCP(system, horizon=horizon, x_goal=x_goal, u_goal=u_goal,
                        running=read(data["L"], at), terminal=read(data["G"], at), p=p,
                        parameters=sampling.from_data(data["parameters"]) if "parameters" in data else None,
                        initial_states=sampling.from_data(data["initial_states"]),

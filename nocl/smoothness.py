@@ -127,11 +127,12 @@ def linear_controls(running: ca.SX, xdot: ca.SX, u: ca.SX) -> list[str]:
 def rounded(expression: ca.SX, z: ca.SX, u: ca.SX, width: ca.SX | float, lower: Array,
             upper: Array) -> ca.SX:
     """A scalar expression in z [n] with each |a|, max(a, b) and min(a, b) that holds u rounded off over about `width`
-    of what its switch is in the box [lower, upper] of z.
+    of what its switch is in the box [lower, upper] of z; the expression itself where there is none.
     """
     function = ca.Function("expression", [z], [expression])
     points = np.random.default_rng(0).uniform(lower, upper, (SAMPLES, len(lower))).T
     work: dict[int, ca.SX] = {}
+    value, sharp = expression, True
     for step in instructions(function):
         if step.op == "OP_OUTPUT":
             value = work[step.args[0]]
@@ -140,8 +141,8 @@ def rounded(expression: ca.SX, z: ca.SX, u: ca.SX, width: ca.SX | float, lower: 
         work[step.out[0]] = _value(step, args, z)
         if step.op in ROUNDED and ca.depends_on(switch := _switch(step.op, args)[0], u):
             size = np.abs(ca.Function("switch", [z], [switch])(points).full()).max()
-            work[step.out[0]] = _round(step.op, args, switch, width * float(size))
-    return value
+            work[step.out[0]], sharp = _round(step.op, args, switch, width * float(size)), False
+    return expression if sharp else value
 
 
 def _round(op: str, args: Sequence[ca.SX], switch: ca.SX, width: ca.SX | float) -> ca.SX:

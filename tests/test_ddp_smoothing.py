@@ -2,10 +2,12 @@
 IPOPT on the same nodes; costs and V are those of the problem itself."""
 
 import pickle
+from dataclasses import replace
 
 import casadi as ca
 import numpy as np
 import pytest
+from test_ddp import problem, random_model
 
 import nocl
 from nocl.solvers import DDP, NMPC
@@ -117,6 +119,10 @@ def test_strictly_convex_problems_are_left_alone():
     assert without_kinks(ocp) is ocp
 
 
+def test_no_states_are_no_solutions():
+    assert len(DDP(cart(P**2 + V**2), intervals=20).solve(np.zeros((0, 2)))) == 0
+
+
 def test_a_solver_goes_to_another_process():
     ddp = DDP(cart(P**2 + V**2), intervals=20)
     x0 = np.array([[1.0, 0.0]])
@@ -161,3 +167,22 @@ def test_training_takes_a_problem_without_a_cost_on_the_control():
     assert 0 <= card["second_opinion"]["price"] < 1e-3
     assert "it costs" in card["second_opinion"]["text"]
     assert card["gap_median"] < 0.02  # to the optimum in the problem's own cost
+
+
+def test_learned_dynamics_take_the_term_too():
+    """f_theta plus random networks, no cost on the force: the cost is that of the plan under f_theta."""
+    model = random_model("double_integrator")
+    ocp = problem("double_integrator")
+    flat = replace(ocp, running=ca.sumsqr(ocp.system.x))
+    ddp = DDP(flat, intervals=20, substeps=1, dynamics=model)
+    x0 = flat.initial_states.sample(2, 0)
+    s = ddp.solve(x0)
+    assert flat.flat_controls == ocp.system.control_names
+    assert s.success.any()
+    step = flat.functions.on(model.to_casadi()).step()
+    for i in np.flatnonzero(s.success):
+        x, total = x0[i], 0.0
+        for u in s.u[i]:
+            x, cost = (v.full().ravel() for v in step(x, u, flat.horizon / 20))
+            total += float(cost[0])
+        assert s.cost[i] == pytest.approx(total + float(flat.G(x)), rel=1e-9)

@@ -32,7 +32,6 @@ from nocl.support.checks import Array
 WEIGHTS = (1e-1, 1e-2, 1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8)  # of the term: those that are tried
 USUAL = WEIGHTS[:4]  # where no problem tells which
 SHARP = 1e-4  # of the size of a kinked term: over how much kinks are rounded for NMPC
-DEEP = 1000  # levels of expressions that are compared
 LITTLE = 1e-3  # of the cost: as small as the term need be
 SMALL = 1e-3  # of the usual cost: costs count as not less; and the term and the rounding may make up for each other
 
@@ -63,7 +62,7 @@ def without_kinks(ocp: OCP) -> OCP:
     """The problem with kinks of L in the controls rounded so little that its cost is the same; itself if it has none.
     """
     L = _rounded(ocp, SHARP)
-    if ca.is_equal(L, ocp.running, DEEP):
+    if L is ocp.running:
         return ocp
     with warnings.catch_warnings():  # of its kinks the problem itself has warned
         warnings.simplefilter("ignore")
@@ -103,7 +102,7 @@ def weights_for(ocp: OCP, posed: OCP, solve: Callable[[Piece, float], Solution],
             break
         kept.append(weight)
         own = in_own_cost(ocp, posed, found[rows]).cost
-        floor = SMALL * usual_sizes(ocp).cost 
+        floor = SMALL * usual_sizes(ocp).cost
         if weight <= SMALL and np.median(np.abs(found.cost[rows] - own) / (np.abs(own) + floor)) <= LITTLE:
             break
         batch = _part(batch, rows, _plans(found, rows))
@@ -146,6 +145,8 @@ def in_own_cost(ocp: OCP, posed: OCP, s: Solution, last: float = 1.0) -> Solutio
     last : the smallest weight that was asked for; messages tell of larger ones
     """
     at, (B, K, nu) = posed.functions.arguments, s.u.shape
+    if not B:
+        return replace(s, p=s.parameters[:, :-1] if ocp.np else None, V_p=None if s.V_p is None else s.V_p[:, :-1])
     more = at.function("more", {"more": posed.running - ocp.running})
     p, h = np.repeat(s.parameters, K, axis=0), np.diff(s.t, axis=1)
 
