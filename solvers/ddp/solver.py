@@ -141,7 +141,7 @@ class DDP:
                 **({"weights": self.weights} if self.smoothed else {})}
 
     def __setstate__(self, options: dict[str, Any]) -> None:
-        found = {name: options.pop(name) for name in ("margin", "weights") if name in options}
+        found: dict[str, Any] = {name: options.pop(name) for name in ("margin", "weights") if name in options}
         DDP.__init__(self, **options)  # the kernel is built, or found in the cache, where it is needed
         self.__dict__.update(found)
 
