@@ -49,7 +49,8 @@ def stability(report: Report, methods: Mapping[str, Any]) -> tuple[Stability, ..
     if "LQR" not in methods:
         laws |= _lqr(ocp)
     goal, middle = Starts(ocp.x_goal[None], ocp.nominal[None]), _middle(report)
-    places = [("goal", LATE * ocp.horizon, goal), ("mid-horizon", MIDDLE * ocp.horizon, middle)]
+    places = [("goal", LATE * ocp.horizon, goal)] if ocp.has_goal else []
+    places += [("mid-horizon", MIDDLE * ocp.horizon, middle)]
     found = [_near(ocp, name, law, where, t, at) for where, t, at in places if len(at) for name, law in laws.items()]
     return tuple([s for s in found if s is not None] + _optimum(report))
 

@@ -52,7 +52,8 @@ class OCP:
     x_goal, u_goal : [nx], [nu]
         The goal pair (x*, u*): it must lie in the system's boxes. L and G need not vanish there. Either may be a
         casadi.SX column in p, ca.vertcat(goal, 0): the attributes then hold its values at the nominal p, and
-        `goals(p)` those at any other.
+        `goals(p)` those at any other. Default: the problem has none, as where a yield is maximised; the attributes
+        then hold a point of reference, the centre of initial_states and the middle of U, and terminal errors are NaN.
     initial_states : Gaussian or Uniform
         Where trajectories start; what a trained controller must cover.
     p : casadi.SX, optional
@@ -87,9 +88,9 @@ class OCP:
     horizon: Any = field(kw_only=True)
     running: ca.SX = field(kw_only=True)
     terminal: ca.SX = field(kw_only=True)
-    x_goal: Vector = field(kw_only=True)
-    u_goal: Vector = field(kw_only=True)
     initial_states: Distribution = field(kw_only=True)
+    x_goal: Any = field(default=None, kw_only=True)
+    u_goal: Any = field(default=None, kw_only=True)
     p: Any = field(default=None, kw_only=True)
     parameters: Distribution | None = field(default=None, kw_only=True)
     constraints: Mapping[str, Any] = field(default_factory=dict, kw_only=True)
@@ -113,10 +114,12 @@ class OCP:
         self._set(running=checks.expression(self.running, 1, ca.vertcat(s.x, s.u, p), "running", owner, time=t),
                   terminal=checks.expression(self.terminal, 1, ca.vertcat(s.x, p), "terminal", owner, s.u, time=t))
         self._check_parameters(owner)
-        for name, n in (("x_goal", s.nx), ("u_goal", s.nu)):
-            self._set(**{name: self._goal(getattr(self, name), n, name, owner)})
-        self._check_goal(owner)
         self._check_initial_states(owner)
+        for name, n, instead in (("x_goal", s.nx, self.initial_states.centre), ("u_goal", s.nu, (s.lbu + s.ubu) / 2)):
+            given = getattr(self, name)
+            none = given is None or isinstance(given, Reference)
+            self._set(**{name: Reference.at(instead) if none else self._goal(given, n, name, owner)})
+        self._check_goal(owner)
         self._check_finite(owner)
         self._check_possible(owner)
         if self.np:
@@ -192,6 +195,18 @@ class OCP:
         if not isinstance(value, ca.SX):
             return checks.vector(value, n, name, owner)
         return Goal.at(checks.expression(value, n, self._all_p, name, owner), self._all_p, self.nominal)
+
+    @property
+    def has_goal(self) -> bool:
+        """Whether the problem was given a goal pair."""
+        return not (isinstance(self.x_goal, Reference) or isinstance(self.u_goal, Reference))
+
+    def refuse_without_goal(self, owner: str) -> None:
+        """ValueError where the problem has no goal pair: for what is nothing without one."""
+        if not self.has_goal:
+            missing = " and ".join(name for name in ("x_goal", "u_goal") if isinstance(getattr(self, name), Reference))
+            raise ValueError(f"{owner} needs a goal pair, but the problem on {self.system.name!r} has no {missing}: "
+                             "give it one, OCP(..., x_goal=, u_goal=), or solve it by NMPC or DDP")
 
     def _check_goal(self, owner: str) -> None:
         s = self.system
@@ -507,7 +522,8 @@ class OCP:
         """`at` parameters [np] that were checked."""
         if not self.np:
             return self
-        x_goal, u_goal = (goal[0] for goal in self.goals(value[None]))
+        x_goal, u_goal = (own if isinstance(own, Reference) else goal[0]
+                          for own, goal in zip((self.x_goal, self.u_goal), self.goals(value[None]), strict=True))
 
         def folded(e: ca.SX) -> ca.SX:
             return ca.substitute(e, self._all_p, ca.DM(value))
@@ -569,16 +585,13 @@ class OCP:
         goal = self.goals(np.atleast_2d(rows))[0]
         return goal[0] if rows.ndim == 1 else beside(goal, axes)
 
-    def check_strict(self, owner: str) -> None:
-        """ValueError where the Hamiltonian is linear in a control, so that second derivatives say nothing of it."""
-        if self.system.xdot is None:
-            return  # the equations are learned: nothing is known of them yet
-        names = linear_controls(self.running, self.system.xdot, self.system.u)
-        if names:
-            raise ValueError(f"{owner}: cost and dynamics are linear in {', '.join(names)}: the optimum jumps between "
-                             "bounds (bang-bang), which no smooth controller has; expected a cost that curves in each "
-                             "control: add a small quadratic term, a thousandth of the usual running cost times "
-                             f"(({names[0]} - its goal) / its range)**2, or solve state by state with NMPC")
+    @cached_property
+    def flat_controls(self) -> tuple[str, ...]:
+        """The controls that the Hamiltonian is linear in, piece by piece where L has kinks: their optimum jumps between
+        bounds (bang-bang), or is singular. Where f is not known, those that L is linear in.
+        """
+        s = self.system
+        return tuple(linear_controls(self.running, ca.SX(0, 1) if s.xdot is None else s.xdot, s.u))
 
     @classmethod
     def quadratic(cls, system: System, *, x_goal: Vector, u_goal: Vector, R: Vector = 0.01, P: Vector = 1.0,
@@ -748,8 +761,8 @@ class OCP:
         lines += [pretty.filled(f"{one.name}{' at the end' * (one.kind == END)}: {one.text(e)}")
                   for one, e in zip(held, constraints, strict=True)]
         lines += [pretty.wrapped(name, e, "    ") for name, e in shared.items()]
-        lines += [pretty.filled(f"goal: x* = {_goal_text(self.x_goal)}, u* = {_goal_text(self.u_goal)}"),
-                  pretty.filled(f"x0 ~ {self.initial_states!r}")]
+        goal = f"x* = {_goal_text(self.x_goal)}, u* = {_goal_text(self.u_goal)}" if self.has_goal else "none"
+        lines += [pretty.filled(f"goal: {goal}"), pretty.filled(f"x0 ~ {self.initial_states!r}")]
         if self.np:
             own = f", the problem's own: {parameter_text(self.p)}" if self.p.numel() else ""
             lines.append(pretty.filled(f"p = ({', '.join(self.parameter_names)}) ~ {self.parameters!r}{own}"))
@@ -758,8 +771,9 @@ class OCP:
     def to_data(self) -> dict[str, Any]:
         """The problem with its system as plain JSON data, exact to the last bit."""
         horizon = {"free": [self.horizon.low, self.horizon.high]} if self.is_free else self.horizon
-        return {"system": self.system.to_data(), "horizon": horizon, "x_goal": self.x_goal.tolist(),
-                "u_goal": self.u_goal.tolist(), "initial_states": sampling.to_data(self.initial_states),
+        x_goal, u_goal = (None if isinstance(goal, Reference) else goal.tolist() for goal in (self.x_goal, self.u_goal))
+        return {"system": self.system.to_data(), "horizon": horizon, "x_goal": x_goal, "u_goal": u_goal,
+                "initial_states": sampling.to_data(self.initial_states),
                 "L": instructions.to_data(self.L), "G": instructions.to_data(self.G),
                 "h": instructions.to_data(self._paths), "path_constraints": list(self.path_constraints),
                 "penalty": self.penalty, "penalty_margin": self.penalty_margin, **self._parameter_data(),
@@ -802,11 +816,13 @@ class OCP:
             constraints = ca.vertsplit(read(data["h"], at)) if data["path_constraints"] else []
             goal = instructions.from_data(data["goal"], [every])(every) if "goal" in data else \
                 (data["x_goal"], data["u_goal"])
+            x_goal, u_goal = (None if data[name] is None else value
+                              for name, value in zip(("x_goal", "u_goal"), goal, strict=True))
             horizon = data["horizon"]
             more = {kind: _constraints_from(data[kind], at) for kind in ("constraints", "terminal_constraints")
                     if kind in data}
             horizon = Free(*horizon["free"]) if isinstance(horizon, Mapping) else horizon
-            return OCP(system, horizon=horizon, x_goal=goal[0], u_goal=goal[1],
+            return OCP(system, horizon=horizon, x_goal=x_goal, u_goal=u_goal,
                        running=read(data["L"], at), terminal=read(data["G"], at), p=p,
                        parameters=sampling.from_data(data["parameters"]) if "parameters" in data else None,
                        initial_states=sampling.from_data(data["initial_states"]),
@@ -864,6 +880,16 @@ class Goal(np.ndarray[Any, np.dtype[np.float64]]):
         goal.expression = expression
         goal.setflags(write=False)
         return goal
+
+
+class Reference(np.ndarray[Any, np.dtype[np.float64]]):
+    """A point that stands where a goal would, of a problem without one; dataclasses.replace keeps it as none."""
+
+    @staticmethod
+    def at(point: Array) -> Reference:
+        reference = np.array(point, dtype=np.float64).view(Reference)
+        reference.setflags(write=False)
+        return reference
 
 
 def _goal_text(goal: Array) -> str:

@@ -27,6 +27,7 @@ STEP = 1e-4  # from a switching point to either side, in units of the way betwee
 FALLS = 0.5  # a smooth bend's slopes differ a hundred times less a hundred times nearer, a kink's as much
 TINY = 1e-150  # a width whose square is not 0
 LEAST = 1e-6  # of the largest slope in the box: less is no kink
+ROUNDED = ("OP_FABS", "OP_FMAX", "OP_FMIN")
 
 
 @dataclass(frozen=True)
@@ -121,6 +122,34 @@ def linear_controls(running: ca.SX, xdot: ca.SX, u: ca.SX) -> list[str]:
     n, m = 1 + xdot.numel(), u.numel()
     rows = [second[i * n:(i + 1) * n, :] for i in range(m)]
     return [s.name() for s, row in zip(ca.vertsplit(u), rows, strict=True) if row.nnz() == 0 or row.is_zero()]
+
+
+def rounded(expression: ca.SX, z: ca.SX, u: ca.SX, width: ca.SX | float, lower: Array, upper: Array) -> ca.SX:
+    """A scalar expression in z [n] with each |a|, max(a, b) and min(a, b) that holds u rounded off over about `width`
+    of what its switch is in the box [lower, upper] of z; the expression itself where there is none.
+    """
+    function = ca.Function("expression", [z], [expression])
+    points = np.random.default_rng(0).uniform(lower, upper, (SAMPLES, len(lower))).T
+    work, sharp = dict[int, ca.SX](), dict[int, ca.SX]()  # values as they are rounded, and as they were
+    value, none = expression, True
+    for step in instructions(function):
+        if step.op == "OP_OUTPUT":
+            value = work[step.args[0]]
+            continue
+        args, were = ([of[a] for a in step.args] if step.op not in ("OP_INPUT", "OP_CONST") else []
+                      for of in (work, sharp))
+        work[step.out[0]], sharp[step.out[0]] = _value(step, args, z), _value(step, were, z)
+        if step.op in ROUNDED and ca.depends_on(switch := _switch(step.op, were)[0], u):
+            size = np.abs(ca.Function("switch", [z], [switch])(points).full()).max()
+            work[step.out[0]], none = _round(step.op, args, width * float(size)), False
+    return expression if none else value
+
+
+def _round(op: str, args: Sequence[ca.SX], width: ca.SX | float) -> ca.SX:
+    """|a|, max(a, b) or min(a, b); the last two are (a + b +- |a - b|) / 2."""
+    switch = _switch(op, args)[0]
+    size = ca.sqrt(switch**2 + width**2) - width
+    return size if op == "OP_FABS" else (args[0] + args[1] + (size if op == "OP_FMAX" else -size)) / 2
 
 
 def smooth_abs(e: ca.SX, width: float) -> ca.SX:

@@ -60,6 +60,7 @@ class LQR:
         infinite = checks.flag(infinite, "infinite", "LQR")
         ocp.refuse_parameters("LQR")
         ocp.refuse_constraints("LQR")
+        ocp.refuse_without_goal("LQR")
         self.ocp, self.infinite = ocp, infinite
         self.A, self.B = (j.full() for j in ocp.functions.jacobian(ocp.x_goal, ocp.u_goal))
         self.Q, self.R, self.S, self.P_final = _hessians(ocp)

@@ -65,6 +65,7 @@ class RRTStar:
         checks.problem(ocp, "RRTStar")
         ocp.refuse_parameters("RRTStar")
         ocp.refuse_constraints("RRTStar")
+        ocp.refuse_without_goal("RRTStar")
         owner = f"RRTStar on {ocp.system.name!r}"
         if (iterations is None) == (seconds is None):
             raise ValueError(f"{owner}: iterations is {iterations!r}, seconds {seconds!r}; expected one of them")

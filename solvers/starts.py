@@ -12,6 +12,7 @@ from nocl.system import System
 
 WAVES = 8  # half waves in a random control, the slow ones the largest
 QUIETEST = 0.003  # its smallest amplitude, in half widths of U
+PARTS = 3  # equal ones of the time, over which controls are held
 FAR = 1.5  # widths of X from its middle: beyond, a rollout costs most and gives least
 HALVINGS = 6  # of a control's distance to u*, until its rollout stays there
 
@@ -35,6 +36,30 @@ def random_controls(ocp: OCP, K: int, n: int, seed: Seed, p: Array | None = None
     goal = ocp.u_goal if p is None else ocp.goals(p)[1][:, None]
     base = np.where(rng.random((n, 1, 1)) < 0.5, np.asarray(goal), (s.lbu + s.ubu) / 2)
     return np.ascontiguousarray(np.clip(base + shape, s.lbu, s.ubu))
+
+
+def levels(system: System, K: int, n: int, rng: np.random.Generator, parts: int) -> Array:
+    """n random controls [n, K, nu] that are held over each of `parts` equal parts of the time: every other one at a
+    bound, the others anywhere in U.
+    """
+    share = rng.random((n, parts, system.nu))
+    at_bound = rng.random(share.shape) < 0.5
+    share = np.where(at_bound, np.round(share), share)
+    held = np.repeat(np.arange(parts), np.diff(np.linspace(0, K, parts + 1).astype(int)))
+    return np.ascontiguousarray(system.lbu + (system.ubu - system.lbu) * share[:, held])
+
+
+def random_start(ocp: OCP, K: int, n: int, seed: Seed, number: int, p: Array | None = None) -> Array:
+    """Random start number 0, 1, 2, ... of n states, [n, K, nu]: smooth controls; of a problem without a goal by turns
+    with such as are held over PARTS of the time.
+
+    On the bioreactor of docs/ddp.md these find the best optimum from 35 % of starts each, and from 69 % under the
+    feedback that holds an equilibrium; constants from 29 %, 20 parts from 4 %, and the best of 32 rollouts no more
+    often than one.
+    """
+    if ocp.has_goal or number % 2:
+        return random_controls(ocp, K, n, seed, p)
+    return levels(ocp.system, K, n, np.random.default_rng(seed), min(PARTS, K))
 
 
 def near(system: System, x: Array) -> Array:

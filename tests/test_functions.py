@@ -22,6 +22,7 @@ DOOR = {  # files that may hold the symbols of a system and the expressions of a
     "nocl/functions.py",  # the door
     "solvers/cnd/lifted.py",  # where a problem is written anew, p and t among its states
     "solvers/ddp/free.py",  # and where its horizon is one of them
+    "solvers/ddp/smoothing.py",  # and where controls that H is linear in have a quadratic term
 }
 SYSTEM = {"x", "u", "p", "xdot"}  # what only they read of a System ...
 OCP = {"running", "terminal"}  # ... and of an OCP

@@ -204,7 +204,6 @@ def problems() -> list[Call]:
         Call("OCP.least", ocp_of().least, {"x": np.zeros((2, 3, 2))}, lambda v: v.shape == (2, 1)),
         Call("OCP.violation", ocp_of().violation, {"least": np.zeros((2, 1))},
              lambda v: v.ndim == 1 and not np.isnan(v).any()),
-        Call("OCP.check_strict", o.check_strict, {"owner": "test"}),
         Call("simulate", partial(nocl.simulate, o), {"controller": LQR(o), "x0": [0.1, 0.0], "f": s.f, "hold": 3,
              "nodes": 5, "kicks": [(0.5, [0.0, 0.1])], "delay": 0.0, "t0": 0.0, "rtol": 1e-6, "atol": 1e-6}, judged,
              {"controller": [np.zeros((1, 4, 1)), [[0.0]] * 3, lambda x, t: "a", lambda x, t: x * np.nan, law(),

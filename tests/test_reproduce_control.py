@@ -98,15 +98,18 @@ def test_nmpc_runs_in_closed_loop(tmp_path):
     assert made.ms > 0
 
 
-def test_without_a_control_cost_nocls_default_says_why_it_refuses(monkeypatch, tmp_path):
+def test_a_method_that_refuses_a_problem_without_control_cost_says_why(monkeypatch, tmp_path):
+    def refuses(*_, **__):
+        raise ValueError("train: not this one")
+
     monkeypatch.setattr(control, "identified", lambda ocp, seed, plan: None)
+    monkeypatch.setattr(controllers, "train", refuses)
     made = QUADROTOR_TABLE.make(Plan(n=2, quick=True), Place("quadrotor", "r0"), tmp_path)
     assert made.error == []
-    assert "refused: " in made.made
-    assert "cost and dynamics are linear in u1" in made.made
+    assert made.made == "refused: train: not this one"
     entry = next(e for e in QUADROTOR_TABLE.entries([made]) if e.way == "r0")
     assert math.isnan(entry.error)
-    assert "refused: train: cost and dynamics are linear in" in QUADROTOR_TABLE.markdown([entry])
+    assert "refused: train: not this one" in QUADROTOR_TABLE.markdown([entry])
 
 
 def test_ddp_counts_its_forward_evaluations():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import nocl
-from nocl.smoothness import kinks, linear_controls
+from nocl.smoothness import _switches, kinks, linear_controls, rounded
 from nocl.solvers import DDP, NMPC
 from nocl.solvers.ddp.solver import DDPSettings
 
@@ -89,9 +89,28 @@ def test_coupled_controls_are_not_linear():
     assert linear_controls(w[0] ** 2, w[0] + w[1], w) == ["w_1"]
 
 
-def test_training_refuses_a_linear_cost_at_the_start():
-    with pytest.raises(ValueError, match=r"linear in u.*bang-bang.*small quadratic term"):
-        nocl.train(problem(p**2 + u))
+def test_flat_controls_are_those_of_the_hamiltonian():
+    assert problem(p**2 + u).flat_controls == ("u",)
+    assert problem(p**2 + 0.1 * u**2).flat_controls == ()
+    with pytest.warns(UserWarning, match="kink where u = 0"):
+        assert problem(ca.fabs(u)).flat_controls == ("u",)  # piece by piece
+
+
+@pytest.mark.parametrize("e", [ca.fabs(u - p / 2), ca.fmax(u, p), ca.fmin(3 * u, 1 - p),
+                               ca.fmax(ca.fabs(u), ca.fabs(p))])
+def test_kinks_in_the_controls_are_rounded_off(e):
+    width = 1e-3
+    w = ca.SX.sym("w")
+    smooth = ca.substitute(rounded(e, z, u, w, *BOX), w, width)
+    points = np.random.default_rng(0).uniform(*BOX, (500, 3)).T
+    gap = ca.Function("gap", [z], [smooth - e])(points).full()
+    assert 0 < np.abs(gap).max() <= 2 * width * 5  # both switches in turn, and what they are at most in the box
+    assert not any(ca.depends_on(one, u) for one in _switches(smooth, z))
+
+
+def test_kinks_in_states_stay():
+    e = u**2 + ca.fabs(p)
+    assert rounded(e, z, u, 1e-3, *BOX) is e
 
 
 def test_solvers_that_fail_at_a_kink_say_so():

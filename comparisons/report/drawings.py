@@ -194,7 +194,8 @@ def phase(ax: Any, ocp: OCP, visited: Array) -> Frame:
     ax.set(xlim=(low[i] - room[i], high[i] + room[i]), ylim=(low[k] - room[k], high[k] + room[k]))
     ax.set_xlabel(s.unit(s.state_names[i]).replace("$", r"\$"))
     ax.set_ylabel(s.unit(s.state_names[k]).replace("$", r"\$"))
-    ax.plot(ocp.x_goal[i], ocp.x_goal[k], "*", color=GOAL, markersize=12)
+    if ocp.has_goal:
+        ax.plot(ocp.x_goal[i], ocp.x_goal[k], "*", color=GOAL, markersize=12)
     (trail,) = ax.plot([], [], color=TRAIL, linewidth=1.5)
     (now,) = ax.plot([], [], "o", color=BODY, markersize=8)
 
@@ -212,7 +213,8 @@ def _against_time(ax: Any, ocp: OCP, visited: Array) -> Frame:
     ax.set(xlim=(0, ocp.horizon), ylim=(low - room, high + room))
     ax.set_xlabel("t")
     ax.set_ylabel(ocp.system.unit(ocp.system.state_names[0]).replace("$", r"\$"))
-    ax.axhline(ocp.x_goal[0], color=GOAL, linestyle=":")
+    if ocp.has_goal:
+        ax.axhline(ocp.x_goal[0], color=GOAL, linestyle=":")
     (trail,) = ax.plot([], [], color=TRAIL, linewidth=1.5)
 
     def frame(x: Array, u: Array, t: float) -> Sequence[Any]:

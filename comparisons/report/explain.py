@@ -81,10 +81,11 @@ def _lost_where(report: Results, m: int, b: int, i: int) -> str:
     k = int(np.abs(error).argmax())
     name = report.ocp.system.state_names[k]
     unit = report.ocp.system.units.get(name, "")
-    miss = f"at the end {name} is off by {number(float(error[k]))}{' ' + unit if unit else ''}"
+    miss = f"; at the end {name} is off by {number(float(error[k]))}{' ' + unit if unit else ''}" \
+        if report.ocp.has_goal else ""
     where = "the terminal cost" if terminal > 2 * running else "the running cost" if running > 2 * terminal else \
         "both"
-    return f"Lost in {where} (running {running:+.3g}, terminal {terminal:+.3g}); {miss}."
+    return f"Lost in {where} (running {running:+.3g}, terminal {terminal:+.3g}){miss}."
 
 
 def _manners(report: Results, m: int, b: int | None, i: int) -> Iterator[str]:

@@ -46,7 +46,7 @@ def payload(report: Results) -> dict[str, Any]:
     nodes, states = kept
     return {"name": s.name, "states": s.state_names, "controls": s.control_names,
             "labels": [s.unit(name) for name in s.names], "horizon": report.ocp.horizon,
-            "goal": [*report.ocp.x_goal.tolist(), *report.ocp.u_goal.tolist()], **_parameters(report),
+            "goal": _goal(report), **_parameters(report),
             "lbu": s.lbu.tolist(), "ubu": s.ubu.tolist(), "explained": explained_method(report),
             "numbers": list(NUMBERS),
             "channels": channels(report), "B": len(report.x0), "x0": floats(report.x0), "gap": floats(report.gap),
@@ -59,6 +59,12 @@ def payload(report: Results) -> dict[str, Any]:
             "held": [{"name": one.name, "bounds": [b for b in (one.low, one.high) if math.isfinite(b)]}
                      for one in limits.others(report.ocp)],
             "plane": plane(report), "obstacles": obstacles(report), "slices": slices(report), **_study(report)}
+
+
+def _goal(report: Results) -> list[float | None]:
+    """(x*, u*); null for each where there is none."""
+    ocp = report.ocp
+    return [*ocp.x_goal.tolist(), *ocp.u_goal.tolist()] if ocp.has_goal else [None] * len(ocp.system.names)
 
 
 def _parameters(report: Results) -> dict[str, Any]:

@@ -92,7 +92,7 @@ def errors(report: Results) -> Table:
     """By coordinate, in its unit."""
     s = report.ocp.system
     body = []
-    for j in report.judged:
+    for j in report.judged if report.ocp.has_goal else ():
         away = report.ocp.from_goal(j.simulation.x[:, -1], report.parameters)
         error = np.abs(away)[np.asarray(j.simulation.success, dtype=bool)]
         if len(error):

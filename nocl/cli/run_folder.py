@@ -111,7 +111,6 @@ class RunFolder:
 
     def train(self, exact: bool) -> CND:
         """The controller and value function, in cnd/; on dynamics/ unless exact."""
-        self.ocp.check_strict("train")  # before dynamics are learned for nothing
         model = None if exact else self.identify()
         data = {} if model is None else {k: v for k, v in model.card[KEY].items() if k in OF_LOGS}
         made_from, there = self._made_from(exact=exact, **data), self._cnd_there()
@@ -124,6 +123,8 @@ class RunFolder:
         settings = TrainSettings.of(self.effort, parameters=self.ocp.np)
         cnd = train(self.ocp, model, seed=self.seed, settings=settings, out=checkpoint)
         cnd.card[KEY] = made_from
+        if opinion := cnd.card.get("second_opinion", {}).get("text"):
+            say(f"controller: {opinion}")
         cnd.save(self.folder / "cnd")
         cnd.plot_training(self.folder / "cnd" / "training.png")
         _forget(checkpoint)

@@ -40,7 +40,7 @@ class Simulation:
     cost: Array  # [B], running + terminal, inf where the horizon was not reached
     running_cost: Array  # [B], integral of L, exact (no penalty)
     terminal_cost: Array  # [B], G(x(T))
-    terminal_error: Array  # [B], ||x(T) - x*||_2, x* the nearest image of the goal (OCP.from_goal)
+    terminal_error: Array  # [B], ||x(T) - x*||_2, x* the nearest image of the goal (OCP.from_goal); NaN without a goal
     control_magnitude: Array  # [B], mean of ||u||_2 over time
     saturation: Array  # [B], share of time with a control at a bound
     clearance: Array  # [B], min of all constraints, at and between nodes, and at the end, in units of their scales; of
@@ -241,7 +241,8 @@ class Judge:
         end = ocp.functions.end.columns(x=x[:, -1], p=self.p)
         terminal = np.where(reached, ocp.G(*end).full().ravel(), np.inf)
         running = np.where(reached, running, np.inf)
-        error = np.where(reached, np.linalg.norm(ocp.from_goal(x[:, -1], self.p), axis=1), np.inf)
+        off = np.linalg.norm(ocp.from_goal(x[:, -1], self.p), axis=1) if ocp.has_goal else np.nan
+        error = np.where(reached, off, np.inf)
         u[~np.isfinite(x).all(axis=2)] = np.nan
         at_end = ocp.least_at_end(x[:, -1], self.p)
         violation, worst = ocp.violation(least, at_end), self.worst(ocp.shares(least, at_end))

@@ -94,7 +94,8 @@ def features(ocp: OCP, labels: Places, dt: Array | None = None, *, plain: bool =
     rush = left / (to_go + LEAST_TIME * ocp.horizon)
     clock = ca.vertcat(tau, ca.log(to_go / ocp.horizon + LEAST_TIME) / 2)
     parts: list[Part] = [(_standard(state, x, tau, moment, half)[once], 1.0), (ca.vertcat(*angles, clock), 1.0),
-                         (rush, np.array([1.0 if i in ocp.periodic else half[i] for i in range(s.nx)])),
+                         *([(rush, np.array([1.0 if i in ocp.periodic else half[i] for i in range(s.nx)]))]
+                           if ocp.has_goal else []),
                          *([(state[once], half[once])] if plain else []),
                          *_of_parameters(ocp, at, off, labels, tau, moment),
                          *([] if own is None else [(at.but("dt").call(own), 0.0)]),

@@ -59,6 +59,7 @@ from nocl.solvers.cnd.validate import (
 from nocl.solvers.cnd.value import ValueLabels, on_fine_grid, value_loss, value_net, value_tails
 from nocl.solvers.ddp.bank import SolutionBank, better, extend
 from nocl.solvers.ddp.global_search import solve_globally
+from nocl.solvers.ddp.opinion import second_opinion
 from nocl.solvers.ddp.solver import DDP, substeps_for
 from nocl.substeps import FINE
 from nocl.support import checks, store
@@ -120,7 +121,6 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
     if ocp.is_free:
         check_law(ocp, dynamics, chosen)
         return LawTraining(ocp, chosen, seed, progress, own).run()
-    ocp.check_strict("train")
     return Training(ocp, dynamics, chosen, seed, out, progress, own).run()
 
 
@@ -167,6 +167,7 @@ class Training:
         self.history: list[dict[str, Any]] = []
         self.losses: list[float] = []
         self.value_card: dict[str, Any] = {}
+        self.opinion: dict[str, Any] = {}  # of NMPC, where it was asked for one
 
     def _inside(self, margin: Array | None) -> None:
         """Labels keep these margins from now on."""
@@ -195,8 +196,7 @@ class Training:
             warnings.warn(f"{self.ocp.system.name}: {remark}", stacklevel=4)
         value = self._value() if s.value else None
         cnd = CND(self.ocp, self.net, value, self._card())
-        shown = sys.stderr.isatty() if self.hidden_progress is None else not self.hidden_progress
-        if shown and cnd.continuous_angles:
+        if self._shown() and cnd.continuous_angles:
             tqdm.write(f"{self.ocp.system.name}: the controller expects {', '.join(cnd.continuous_angles)} as a "
                        "continuous angle, since the problem tells turns apart; cnd.unwrapped() takes it in (-pi, pi]",
                        file=sys.stderr)
@@ -211,6 +211,7 @@ class Training:
 
             first = Problems.initial(self.ocp, s.seeds, rng)
             seeds = solve_globally(self.ddp, first.x, p=first.given_p, starts=s.starts, seed=rng, report=report)
+            seeds = self._second_opinion(seeds)
             self.bank = SolutionBank.of(self.ddp, self._held(seeds))
             if s.states:
                 further = Problems.initial(self.ocp, s.states, rng)
@@ -222,6 +223,22 @@ class Training:
             parts = [self.bank.solution] + ([tube(self.ddp, self.bank, s.tails, s.width, rng)] if s.tails else [])
             self.labels = Labels.join([self._labels(p, rng) for p in parts])
             self.first = len(self.labels)
+
+    def _second_opinion(self, seeds: Solution) -> Solution:
+        """The seeds, better ones where NMPC knows some, and then all of them solved from these: where a quadratic term
+        was added, or no goal says where to look for optima."""
+        if self.ocp.has_goal and not self.ddp.smoothed:
+            return seeds
+        said = second_opinion(self.ddp, seeds)
+        self.opinion = said.card
+        if said.text and self._shown():
+            tqdm.write(f"{self.ocp.system.name}: {said.text}", file=sys.stderr)
+        if not said.improved:
+            return seeds
+        return solve_globally(self.ddp, seeds.x[:, 0], p=seeds.p, starts=0, known=said.solution, seed=self.seed)
+
+    def _shown(self) -> bool:
+        return sys.stderr.isatty() if self.hidden_progress is None else not self.hidden_progress
 
     def _held(self, solution: Solution) -> Solution:
         """Without success where constraints are lost."""
@@ -416,6 +433,7 @@ class Training:
                 "fitting_seconds": round(self.fitting, 1),  # of these, fits of networks; the others solve problems
                 "fitting_cpu_seconds": round(self.fitting_cpu, 1),
                 "dynamics_evaluations": self._evaluations(), "substeps": self.substeps,
+                **({"second_opinion": self.opinion} if self.opinion else {}),
                 "settings": asdict(self.settings), **own, "history": self.history, "value": self.value_card}
 
     def _evaluations(self) -> int:
@@ -447,7 +465,7 @@ class Training:
             state[f"solved-{i}"] = _tensors({k: v for k, v in s.arrays().items() if k != "message"})
         meta = {"identity": self._identity(), "solved": len(self.solved),
                 "margin": None if self.margin is None else self.margin.tolist(),
-                "round": self.round, "history": self.history, "seconds": self.seconds,
+                "opinion": self.opinion, "round": self.round, "history": self.history, "seconds": self.seconds,
                 "fitting": self.fitting, "fitting_cpu": self.fitting_cpu,
                 "first": self.first, "several": self.bank.several, "evaluations": self._evaluations()}
         self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
@@ -468,7 +486,7 @@ class Training:
         self.solved = [_converged(_arrays(state[f"solved-{i}"])) for i in range(meta["solved"])]
         self.round, self.history, self.first = meta["round"], meta["history"], meta["first"]
         self.seconds, self.fitting, self.fitting_cpu = meta["seconds"], meta["fitting"], meta["fitting_cpu"]
-        self.evaluations = meta.get("evaluations", 0)
+        self.evaluations, self.opinion = meta.get("evaluations", 0), meta.get("opinion", {})
         self._network()
         self.net.double().load_state_dict(state["policy"])
         self.net.eval().requires_grad_(False)

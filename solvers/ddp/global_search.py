@@ -2,7 +2,8 @@
 
 These are u*, the goal held by feedback, and then by turns smooth random controls and, what found most on cart-poles
 from anywhere (docs/ddp.md), smooth random controls under the feedback that holds an equilibrium, from a random time on:
-a pole that can be caught is, which no open-loop control of an unstable system stumbles on.
+a pole that can be caught is, which no open-loop control of an unstable system stumbles on. A problem without a goal has
+none to hold, but equilibria, and its random controls are by turns smooth and held over a few parts of the time.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from nocl.solvers.ddp.batch import bytes_each
 from nocl.solvers.ddp.solver import DDP
 from nocl.solvers.mirrors import Mirror, mirrors
 from nocl.solvers.search import Found, Guess, Moves, Rows, Search
-from nocl.solvers.starts import HALVINGS, near, random_controls, smooth, spread_horizon
+from nocl.solvers.starts import HALVINGS, near, random_start, smooth, spread_horizon
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
@@ -206,10 +207,10 @@ class _States:
         ddp, n = self.ddp, len(rows[at])
         if number == 0:
             return {}
-        if number == 1:
+        if number == 1 and ddp.ocp.has_goal:
             return self.holds.goal(self.p[rows[at]])
         if number % 2:
-            u = random_controls(ddp.ocp, ddp.intervals, n, rng, self.p[rows[at]])
+            u = random_start(ddp.ocp, ddp.intervals, n, rng, number // 2, self.p[rows[at]])
             return self._tamed(rows[at], {"u": u, **times})
         return self._tamed(rows[at], {**self.holds.random(self.p[rows[at]], rng), **times})
 

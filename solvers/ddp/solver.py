@@ -15,7 +15,7 @@ import sys
 import warnings
 from collections import Counter
 from dataclasses import replace
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,10 +33,11 @@ from nocl.solvers.ddp.batch import Job, Piece, assembled, pieces
 from nocl.solvers.ddp.constraints import ConstraintRows, rows_of
 from nocl.solvers.ddp.free import FreeTime, lifted, with_horizons
 from nocl.solvers.ddp.kernel import ddp_source, pack_weights
+from nocl.solvers.ddp.smoothing import continued, in_own_cost, regularised, weights_for, with_weight
 from nocl.solvers.ddp.without_compiler import ddp_kernel
 from nocl.solvers.ddp.work import CONVERGED, GROWTH, DDPSettings, Work
 from nocl.solvers.grid import fastest_at_start, firsts, followed, measured
-from nocl.solvers.starts import middle
+from nocl.solvers.starts import middle, random_start
 from nocl.substeps import COARSE, Grid, settled
 from nocl.support import checks
 from nocl.support.checks import Array
@@ -45,6 +46,9 @@ from nocl.support.pool import Journal, Pool, stream
 
 if TYPE_CHECKING:
     from nocl.sysid.identification import LearnedDynamics
+
+
+FIRST, FEW = 4, 12  # substeps, and starts of each state, by which it is found out how fast a plant without a goal gets
 
 
 class DDP:
@@ -75,6 +79,9 @@ class DDP:
         In place of the problem's own constraints.
     cache : folder for compiled kernels, optional
         Default: the folder that NOCL_CACHE names, or else one that goes with the process.
+
+    Controls that the Hamiltonian is linear in (`OCP.flat_controls`) are solved with a small quadratic term
+    (nocl/solvers/ddp/smoothing.py) where the horizon is a number; costs are those of the problem without it.
     """
 
     def __init__(self, ocp: OCP, *, intervals: int = 80, substeps: int | None = None,
@@ -93,7 +100,8 @@ class DDP:
         if settings is not None:
             checks.instance(DDPSettings, settings, "settings", "DDP", "DDPSettings(max_iterations=...)")
         self.ocp, self.intervals, self.settings = ocp, int(intervals), settings or DDPSettings()
-        self.posed = lifted(ocp) if ocp.is_free else ocp  # what the kernel solves
+        self.smoothed = bool(ocp.flat_controls) and not ocp.is_free
+        self.posed = _posed(ocp, self.smoothed)  # what the kernel solves
         self.constraints, self.dynamics, self.cache = constraints, dynamics, cache
         self.between = None if between is None else checks.flag(between, "between", "DDP")
         self.margin: Array | None = None  # see `inside`
@@ -111,6 +119,13 @@ class DDP:
         self.kernel = ddp_kernel(self.posed, dynamics, cache, self.substeps, self._multiplied)
         self._lb, self._ub = np.ascontiguousarray(ocp.system.lbu), np.ascontiguousarray(ocp.system.ubu)
 
+    @cached_property
+    def weights(self) -> tuple[float, ...]:
+        """Of the quadratic term in flat controls, those that solutions are continued through."""
+        x0, p = firsts(self.ocp)
+        few = Piece("few", 0, x0, np.zeros(len(x0)), {}, False, p)
+        return weights_for(self.ocp, self.posed, self._descended, few)
+
     @property
     def _multiplied(self) -> ConstraintRows | None:
         """The rows that multipliers hold, none or not; None where the kernel knows of no such rows."""
@@ -122,12 +137,13 @@ class DDP:
                              "expected the constraints of its problem: leave `rows` out, or use workers of this one")
         return {"ocp": self.ocp, "intervals": self.intervals, "substeps": self.substeps, "dynamics": self.dynamics,
                 "settings": self.settings, "constraints": self.constraints, "between": self.between,
-                "threads": self.threads, "cache": self.cache, "margin": self.margin}
+                "threads": self.threads, "cache": self.cache, "margin": self.margin,
+                **({"weights": self.weights} if self.smoothed else {})}
 
     def __setstate__(self, options: dict[str, Any]) -> None:
-        margin = options.pop("margin")
+        found: dict[str, Any] = {name: options.pop(name) for name in ("margin", "weights") if name in options}
         DDP.__init__(self, **options)  # the kernel is built, or found in the cache, where it is needed
-        self.margin = margin
+        self.__dict__.update(found)
 
     def inside(self, margin: Array) -> DDP:
         """The same solver, which holds each row further inside, by a share of its scale [rows of a stage, then of the
@@ -184,7 +200,14 @@ class DDP:
 
     def descend(self, batch: Piece) -> Solution:
         """Solve one piece of a batch, here."""
-        work = self._work(batch.x0, batch.t0, batch.guess, batch.p)
+        if self.smoothed:
+            found = continued(self._descended, batch, self.weights)
+            return in_own_cost(self.ocp, self.posed, found, self.weights[-1])
+        return self._descended(batch)
+
+    def _descended(self, batch: Piece, weight: float | None = None) -> Solution:
+        """A piece solved; weight : of the quadratic term, where there is one; default: the last."""
+        work = self._work(batch.x0, batch.t0, batch.guess, batch.p, weight)
         work.descend()
         if not (self.between and isinstance(work, Augmented)):
             return work.solution(batch.curvature)
@@ -240,7 +263,8 @@ class DDP:
             return known
         T, free = known.t[:, -1], self.ocp.is_free
         t, x = (known.t / T[:, None], with_horizons(known.x, T)) if free else (known.t, known.x)
-        return replace(known, cut=known.success & self._dips.cut(t, x, known.u, known.parameters))
+        p = with_weight(known.p, len(known), self.weights[-1]) if self.smoothed else known.parameters
+        return replace(known, cut=known.success & self._dips.cut(t, x, known.u, p))
 
     def rollout(self, x0: Array, p: Array | None = None, **guess: Array) -> Array:
         """The states [B, K+1, nx] from x0 [B, nx] at t0 = 0 under a guess of `solve`'s: where the descent begins.
@@ -265,8 +289,10 @@ class DDP:
             rows = rows[work.mu[rows] <= s.largest_damping]
         return work.gain[..., :x.shape[2]]
 
-    def _work(self, x0: Array, t0: Array, guess: dict[str, Array], p: Array | None) -> Work:
+    def _work(self, x0: Array, t0: Array, guess: dict[str, Array], p: Array | None,
+              weight: float | None = None) -> Work:
         u, x, gain = (guess.get(name) for name in ("u", "x", "gain"))
+        p = with_weight(p, len(x0), weight or self.weights[-1]) if self.smoothed else p
         if not self.ocp.is_free:
             return (Augmented if self.held else Work)(self, x0, t0, u, x, gain, p)
         T = guess["t"][:, -1] if "t" in guess else np.full(len(x0), middle(self.ocp.horizon))
@@ -337,6 +363,13 @@ class DDP:
         return times
 
 
+def _posed(ocp: OCP, smoothed: bool) -> OCP:
+    """The problem as the kernel solves it."""
+    if ocp.is_free:
+        return lifted(ocp)
+    return regularised(ocp) if smoothed else ocp
+
+
 @lru_cache(maxsize=32)
 def substeps_for(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int, tolerance: float = COARSE) -> int:
     """As many as solutions from a few initial states ask for, so that they are off by `tolerance` at most."""
@@ -344,14 +377,32 @@ def substeps_for(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int, tol
     tried = ocp if ocp.states_only or free else ocp.unconstrained  # a few descents, to see how fast the plant is
     functions, (x0, p) = _functions(tried, dynamics), firsts(ocp)
 
-    def ask(substeps: int) -> Grid | None:
+    def solved(substeps: int) -> Solution:
         ddp = DDP(tried, intervals=intervals, substeps=substeps, dynamics=dynamics,
                   constraints="hard" if free else "soft")
         ddp.checked = True
-        return measured(tried, functions, ddp.solve(x0, p=p, progress=False), substeps)
+        return ddp.solve(x0, p=p, progress=False) if ocp.has_goal else _best_of_few(ddp, x0, p)
+
+    def ask(substeps: int) -> Grid | None:
+        found = solved(substeps) if ocp.has_goal else fine()
+        return measured(tried, functions, found, substeps)
+
+    @cache
+    def fine() -> Solution:
+        """Without a goal optima may be where a coarse grid has none: those of a fine one are asked about."""
+        return solved(FIRST)
 
     step = (middle(ocp.horizon) if free else ocp.horizon) / intervals
     return settled(f"DDP of {ocp.system.name}", ask, step, lambda: fastest_at_start(ocp, functions), tolerance)
+
+
+def _best_of_few(ddp: DDP, x0: Array, p: Array) -> Solution:
+    """The best of FEW starts of each state, of a problem without a goal."""
+    B, rng = len(x0), np.random.default_rng(0)
+    u = np.concatenate([random_start(ddp.ocp, ddp.intervals, B, rng, number, p) for number in range(FEW)])
+    found = ddp.solve(np.tile(x0, (FEW, 1)), u=u, p=np.tile(p, (FEW, 1)) if ddp.ocp.np else None, progress=False)
+    best = found.cost.reshape(FEW, B).argmin(axis=0)
+    return found[best * B + np.arange(B)]
 
 
 def _functions(ocp: OCP, dynamics: LearnedDynamics | None) -> Functions:

@@ -11,7 +11,7 @@ from nocl.judge.laws import answer_of, takes_p
 from nocl.ocp import OCP
 from nocl.solvers.lqr import LQR
 from nocl.solvers.nmpc.transcription import Transcription
-from nocl.solvers.starts import HALVINGS, near, random_controls, spread_horizon
+from nocl.solvers.starts import HALVINGS, near, random_start, spread_horizon
 from nocl.support import checks
 from nocl.support.checks import Array
 
@@ -32,9 +32,10 @@ def starts(program: Transcription, lqr: LQR | None, x0: Array, t: Array, begin: 
     found: list[Guess] = [(np.tile(x0, (N + 1, 1)), u_goal)]
     if begin + n > 1 and lqr is not None:
         found += lqr_rollout(program, lqr, x0, t, p)
-    found.append((x0 + np.linspace(0.0, 1.0, N + 1)[:, None] * -ocp.from_goal(x0, row[0]), u_goal))
-    found += [(x, u_goal) for x in (sides(ocp, x0, N, t, p) if program.n_path else [])]
-    random = (random_controls(ocp, N, 1, np.random.default_rng([seed, number]), row)[0]
+    if ocp.has_goal:
+        found.append((x0 + np.linspace(0.0, 1.0, N + 1)[:, None] * -ocp.from_goal(x0, row[0]), u_goal))
+        found += [(x, u_goal) for x in (sides(ocp, x0, N, t, p) if program.n_path else [])]
+    random = (random_start(ocp, N, 1, np.random.default_rng([seed, number]), number, row)[0]
               for number in range(max(begin, len(found)), begin + n))
     return found[begin:begin + n] + [controlled(program, x0, u, t, p) for u in random]
 

@@ -155,7 +155,7 @@ function drawRuns() {
                             showarrow: false, font: {size: 12, color: css("--quiet")}});
     const across = (y, dash) => extra.shapes.push({type: "line", xref: "x" + id, yref: "y" + id, x0: 0, x1: D.horizon, y0: y, y1: y,
                                                    layer: "below", line: {color: css("--quiet"), width: 1, dash}});
-    if (!held) across(goal(k), "dot");
+    if (!held && goal(k) !== null) across(goal(k), "dot");
     const values = kept.flatMap((r) => r ? r[c].filter((v) => v !== null) : []), low = Math.min(...values), high = Math.max(...values);
     const bounds = held ? held.bounds.map((y) => [y, false]) : D.lines.filter((l) => l[0] === k).map((l) => [l[1], l[2]]);
     bounds.filter(([y]) => y >= 2 * low - high && y <= 2 * high - low).forEach(([y, last]) => traces.push({type: "scatter", mode: "lines",
