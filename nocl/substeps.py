@@ -11,6 +11,8 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 
+RK4, RADAU = "rk4", "radau"
+INTEGRATORS = (RK4, RADAU)
 FINEST = 128  # steps in an interval, taken for the truth
 TRIED = (1, 2, 4, 8, 16, 32)  # substeps, in this order
 COARSE = 1e-2  # a larger error is worth a warning

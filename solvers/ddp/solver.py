@@ -37,7 +37,7 @@ from nocl.solvers.ddp.without_compiler import ddp_kernel
 from nocl.solvers.ddp.work import CONVERGED, GROWTH, DDPSettings, Work
 from nocl.solvers.grid import fastest_at_start, firsts, followed, measured
 from nocl.solvers.starts import middle
-from nocl.substeps import COARSE, Grid, settled
+from nocl.substeps import COARSE, RK4, Grid, settled
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
@@ -77,7 +77,7 @@ class DDP:
         Default: the folder that NOCL_CACHE names, or else one that goes with the process.
     """
 
-    def __init__(self, ocp: OCP, *, intervals: int = 80, substeps: int | None = None,
+    def __init__(self, ocp: OCP, *, intervals: int = 80, substeps: int | None = None, integrator: str | None = None,
                  dynamics: LearnedDynamics | None = None, settings: DDPSettings | None = None,
                  constraints: str = "hard", between: bool | None = None, threads: int | None = None,
                  cache: str | os.PathLike[str] | None = None, rows: ConstraintRows | None = None) -> None:
@@ -103,12 +103,13 @@ class DDP:
         self.evaluations: Counter[str] = Counter()  # of f in this process, one for each state: "rollout", "backward"
         net = None if dynamics is None else _fitting(ocp, dynamics)
         self._weights = np.zeros(1) if net is None else pack_weights(net)
-        self.substeps = int(substeps or substeps_for(ocp, dynamics, self.intervals))
+        self.integrator, self.substeps = integrator or RK4, int(substeps or 1)
         self._own_rows = rows is not None
         given = rows_of(self.posed) if rows is None else rows
         self.rows = ConstraintRows() if constraints == "soft" else given
         self.held = self.rows.count(self.intervals)  # how many rows a plan has that multipliers hold
-        self.kernel = ddp_kernel(self.posed, dynamics, cache, self.substeps, self._multiplied)
+        self.kernel = ddp_kernel(self.posed, dynamics, cache, self.substeps, self._multiplied,
+                                 self.integrator)
         self._lb, self._ub = np.ascontiguousarray(ocp.system.lbu), np.ascontiguousarray(ocp.system.ubu)
 
     @property

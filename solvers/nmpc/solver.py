@@ -30,7 +30,7 @@ from nocl.solvers.nmpc.tasks import Outcome, Task, attempt, failure, outside, so
 from nocl.solvers.nmpc.transcription import BACKENDS, Answer, Transcription
 from nocl.solvers.search import Found, Moves, Rows, Search
 from nocl.solvers.starts import middle
-from nocl.substeps import Grid, settled
+from nocl.substeps import RADAU, RK4, Grid, settled
 from nocl.support import checks, compiler
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
@@ -83,6 +83,7 @@ class NMPC:
     dynamics: Any = field(default=None, kw_only=True)
     solver: str = field(default="fatrop", kw_only=True)
     substeps: int | None = field(default=None, kw_only=True)
+    integrator: str | None = field(default=None, kw_only=True)
     horizon: float | None = field(default=None, kw_only=True)
     terminal: Any = field(default=None, kw_only=True)
     starts: int = field(default=8, kw_only=True)
@@ -156,7 +157,8 @@ class NMPC:
         options = sorted((self.options or {}).items())
         return fingerprint(self.ocp.to_data(), self.dynamics, self.terminal,
                            int(self.intervals), int(self.substeps or 0), self.constraints, self.solver, options,
-                           *([list(self.soft)] if self.soft else []), *([self.between] if self.between else []))
+                           *([list(self.soft)] if self.soft else []), *([self.between] if self.between else []),
+                           *([self.integrator] if self.integrator == RADAU else []))
 
     @property
     def program(self) -> Transcription:
@@ -374,7 +376,7 @@ def shared_program(recipe: _Recipe) -> Transcription:
     m = recipe.nmpc
     return Transcription(m.ocp, dynamics_function(m.ocp, m.dynamics), int(m.intervals), int(m.substeps or 1),
                          m.constraints == "soft", m.solver, tuple(sorted((m.options or {}).items())), m.terminal,
-                         None if m._folder is None else (m.key, m._folder), tuple(m.soft))
+                         None if m._folder is None else (m.key, m._folder), tuple(m.soft), m.integrator or RK4)
 
 
 @lru_cache(maxsize=KEPT)
