@@ -248,8 +248,8 @@ class Functions:
         return at.function("step", {"end": end, "cost": cost}, h=h)
 
     def collocated(self, *, soft: bool = True, substeps: int = 1) -> ca.Function:
-        """(x, u[, t][, p], h, z [substeps s nx]) -> (end, cost, residual [substeps s nx]) of an interval by Radau steps:
-        what it makes of stages z, which are those of the steps where the residual is 0.
+        """(x, u[, t][, p], h, z [substeps s nx]) -> (end, cost, residual [substeps s nx]) of an interval by Radau steps
+        with stages z: the true ones where the residual is 0.
         """
         at = self.stage
         h, z = at.sym("h"), at.sym("z", substeps * radau.STAGES * self.system.nx)
@@ -265,7 +265,7 @@ class Functions:
         return at.function("collocated", {"end": end, "cost": cost, "residual": ca.vertcat(*gaps)}, h=h, z=z)
 
     def radau_path(self, substeps: int = 1) -> ca.Function:
-        """(x, u[, t][, p], h) -> z [substeps s nx], the stages of all steps of an interval; NaN where there are none."""
+        """(x, u[, t][, p], h) -> z [substeps s nx], the stages of an interval's steps; NaN where none are found."""
         at = self.stage_in_MX
         h, found = at.sym("h"), list[Any]()
         solve = at.radau_stages(h / substeps)

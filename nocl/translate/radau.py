@@ -1,6 +1,6 @@
 """Implicit steps for stiff systems: Radau IIA with controls held, for CasADi.
 
-    X_i = x + h sum_j a_ij f(X_j, u, t + c_j h),   x+ = X_s,   the integral of L: h sum_j b_j L(X_j, u, t + c_j h), b = a_s
+    X_i = x + h sum_j a_ij f(X_j, u, t + c_j h),  x+ = X_s,  int L dt = h sum_j b_j L(X_j, u, t + c_j h),  b = a_s
 
 of order 2 s - 1; L-stable: what is far faster than a step is at rest at its end. csrc/radau.h has the same in C.
 
@@ -20,6 +20,7 @@ from nocl.support.checks import Array
 STAGES = 3
 ITERATIONS = 30  # of Newton's method at most
 SETTLED = 1e-9  # its correction, as a share of a usual state, after which it has converged: what is left is its square
+LEFT = 1e-6  # of a usual state, by which the equations may be off: CasADi's root finder calls anything a success
 S6 = np.sqrt(6.0)
 TABLES = {  # stages -> (c, a)
     2: ([1 / 3, 1], [[5 / 12, -1 / 12], [3 / 4, 1 / 4]]),
@@ -46,10 +47,11 @@ def stages(equations: ca.Function, unit: Array, inputs: Sequence[ca.MX]) -> ca.M
     z, given = ca.MX.sym("z", size.size), [ca.MX.sym("given", i.numel()) for i in inputs]
     solver = ca.rootfinder("radau", "newton", {"x": z, "p": ca.vertcat(*given),
                                                "g": equations(z * size, *given) / size},
-                           {"error_on_fail": False, "max_iter": ITERATIONS, "abstol": 1e-13, "abstolStep": SETTLED**1.5,
-                            "line_search": False, "print_iteration": False})
-    found = solver(0, ca.vertcat(*inputs))
-    return found * size
+                           {"error_on_fail": False, "show_eval_warnings": False, "max_iter": ITERATIONS, "abstol": 1e-13, "abstolStep": SETTLED**1.5,
+                            "line_search": False})
+    found = solver(0, ca.vertcat(*inputs)) * size
+    left = ca.norm_inf(equations(found, *inputs) / size)
+    return found + ca.if_else(left <= LEFT, 0, np.nan)
 
 
 def radau_cost(z: Moment, L: Moment, x: Any, u: Any, h: Any, substeps: int = 1, t: Any = None) -> tuple[Any, Any]:

@@ -3,8 +3,9 @@
 Variables w = [x_0, u_0, x_1, u_1, ..., x_N], parameters p = [x_0, h_0, ..., h_{N-1}, t_N], the lengths of the
 intervals and the time of the last node, then the parameters of the problem.
 Constraints, stage by stage: x_{k+1} - F(x_k, u_k; h_k) = 0, then x_0 - p = 0 at k = 0 and the problem's own
-(held.py). Implicit steps have their stages z_k behind u_k, F is then of (x_k, u_k, z_k), and their equations stand last. A free horizon T stands behind the state of each node, T_{k+1} = T_k, and h_k are then shares of it. A soft
-constraint has slacks behind u_k. A gap's multiplier is minus the costate of the node that it leads to:
+(held.py). Implicit steps have their stages z_k behind u_k: F is of (x_k, u_k, z_k), and their equations stand last. A
+free horizon T stands behind the state of each node, T_{k+1} = T_k, and h_k are then shares of it. A soft constraint has
+slacks behind u_k. A gap's multiplier is minus the costate of the node that it leads to:
 lambda_{k+1} = dJ*/dx_{k+1}.
 """
 
@@ -377,9 +378,9 @@ class Transcription:
         return [0.0]  # seconds of the slowest solve that came back
 
     @cached_property
-    def settled(self) -> dict[str, int]:
-        """What its first solutions have shown once they were held against the plant: `substeps` that they ask for,
-        whether that is still `coarse`; and whether it was `told` of a program with a number of its own."""
+    def settled(self) -> dict[str, Any]:
+        """What its first solutions have shown once they were held against the plant, by the integrator that was asked
+        for; and whether it was `told` of a program with steps of its own."""
         return {}
 
     @cached_property
@@ -528,7 +529,7 @@ class Transcription:
         """What its hard inequalities along the trajectory dip by between nodes."""
         of = self.functions
         soft = np.array([name in self.eased for name in of.rows.names], dtype=bool)
-        return Dips(of, of.rows.column / ca.DM(of.scales), of.rows.equal | soft, self.substeps)
+        return Dips(of, of.rows.column / ca.DM(of.scales), of.rows.equal | soft, self.substeps, self.integrator)
 
     @cached_property
     def elastic(self) -> Transcription:
