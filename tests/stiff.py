@@ -45,7 +45,7 @@ def polymerisation() -> nocl.OCP:
     Its horizon there is 20 steps of 50 s; its cost, the product, has a small quadratic one of the controls here.
     """
     names = ("m_W", "m_A", "m_P", "T_R", "T_S", "T_M", "T_EK", "T_AWT", "fed", "T_adiab")
-    m_W, m_A, m_P, T_R, T_S, T_M, T_EK, T_AWT, fed, T_adiab = x = [ca.SX.sym(name) for name in names]
+    m_W, m_A, m_P, T_R, T_S, T_M, T_EK, T_AWT, *_ = x = [ca.SX.sym(name) for name in names]
     feed, T_in_M, T_in_EK = u = [ca.SX.sym(name) for name in ("feed", "T_in_M", "T_in_EK")]
     R, T_F, E_a, dH, A_tank, k_0, k_U2, k_U1 = 8.314, 298.15, 8500.0, 950.0, 65.0, 7.0, 32.0, 4.0
     m_jacket, f_jacket, m_coolant, f_coolant, m_loop, f_loop, m_steel = 5e3, 3e5, 1e3, 1e5, 200.0, 2e4, 3.9e4

@@ -45,10 +45,10 @@ def stages(equations: ca.Function, unit: Array, inputs: Sequence[ca.MX]) -> ca.M
     """z where equations(z, *inputs) = 0, an MX; NaN where Newton's method finds none. unit [nx]: usual states."""
     size = np.tile(unit, STAGES)
     z, given = ca.MX.sym("z", size.size), [ca.MX.sym("given", i.numel()) for i in inputs]
-    solver = ca.rootfinder("radau", "newton", {"x": z, "p": ca.vertcat(*given),
-                                               "g": equations(z * size, *given) / size},
-                           {"error_on_fail": False, "show_eval_warnings": False, "max_iter": ITERATIONS, "abstol": 1e-13, "abstolStep": SETTLED**1.5,
-                            "line_search": False})
+    scaled = {"x": z, "p": ca.vertcat(*given), "g": equations(z * size, *given) / size}
+    solver = ca.rootfinder("radau", "newton", scaled, {
+        "error_on_fail": False, "show_eval_warnings": False, "max_iter": ITERATIONS, "abstol": 1e-13,
+        "abstolStep": SETTLED**1.5, "line_search": False})
     found = solver(0, ca.vertcat(*inputs)) * size
     left = ca.norm_inf(equations(found, *inputs) / size)
     return found + ca.if_else(left <= LEFT, 0, np.nan)
