@@ -141,7 +141,8 @@ def test_constraints_hold_with_implicit_steps_by_multipliers_and_in_the_program(
     theirs = nmpc.solve(x0, mine, workers=1)
     assert mine.success.all()
     assert mine.x[0, :, 1].min() == pytest.approx(-0.5, abs=1e-6)
-    np.testing.assert_allclose(theirs.cost, mine.cost, rtol=1e-7)
+    np.testing.assert_allclose(theirs.cost, mine.cost, rtol=1e-5)
+    assert (mine.cost <= theirs.cost).all()  # IPOPT and fatrop stop 2e-6 above it, and 1e-6 apart
 
 
 def test_rows_do_not_depend_on_each_other():
