@@ -31,9 +31,11 @@ import casadi as ca
 
 from nocl.constraints import PATH, Measure, Rows
 from nocl.parameters import TIME, time
+from nocl.substeps import RADAU, RK4
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.system import System
+from nocl.translate import radau
 from nocl.translate.arguments import Arguments
 from nocl.translate.rk4 import rk4_cost
 
@@ -76,10 +78,19 @@ class Functions:
     @cached_property
     def stage(self) -> Stage:
         """(x, u[, t][, p]): in SX, or in MX where f is."""
-        own = self.arguments
         if self.dynamics is None or self.dynamics.is_a("SXFunction"):
-            return Stage(own.symbols, self)
-        return Stage(Arguments.new(ca.MX, **{n: s.numel() for n, s in own.symbols.items()}).symbols, self)
+            return Stage(self.arguments.symbols, self)
+        return self.stage_in_MX
+
+    @cached_property
+    def stage_in_MX(self) -> Stage:
+        """(x, u[, t][, p]) as new symbols in MX."""
+        sizes = {n: s.numel() for n, s in self.arguments.symbols.items()}
+        return Stage(Arguments.new(ca.MX, **sizes).symbols, self)
+
+    def stage_of(self, integrator: str) -> Stage:
+        """The stage that steps of a kind are expressions in: implicit ones call a root finder, which SX cannot."""
+        return self.stage if integrator == RK4 else self.stage_in_MX
 
     @cached_property
     def scales(self) -> Array:
@@ -229,12 +240,57 @@ class Functions:
         H = ca.densify(ca.hessian(ca.dot(mu, h), x)[0])
         return self.node.function("h_derivatives", {"h": h, "h_x": ca.jacobian(h, x), "h_xx": H}, mu=mu)
 
-    def step(self, *, soft: bool = True, substeps: int = 1) -> ca.Function:
-        """(x, u[, t][, p], h) -> (end, cost) of an interval from t to t + h with u held, by RK4; see Stage.interval."""
-        at = self.stage
+    def step(self, *, soft: bool = True, substeps: int = 1, integrator: str = RK4) -> ca.Function:
+        """(x, u[, t][, p], h) -> (end, cost) of an interval from t to t + h with u held; see Stage.interval."""
+        at = self.stage_of(integrator)
         h = at.sym("h")
-        end, cost = at.interval(h, soft=soft, substeps=substeps)
+        end, cost = at.interval(h, soft=soft, substeps=substeps, integrator=integrator)
         return at.function("step", {"end": end, "cost": cost}, h=h)
+
+    def collocated(self, *, soft: bool = True, substeps: int = 1) -> ca.Function:
+        """(x, u[, t][, p], h, z [substeps s nx]) -> (end, cost, residual [substeps s nx]) of an interval by Radau steps
+        with stages z: the true ones where the residual is 0.
+        """
+        at = self.stage
+        h, z = at.sym("h"), at.sym("z", substeps * radau.STAGES * self.system.nx)
+        parts, t = iter(ca.vertsplit(z, z.numel() // substeps)), at.symbols.get(TIME)
+        gaps: list[Any] = []
+
+        def given(x: Any, u: Any, *now: Any) -> Any:
+            part = next(parts)
+            gaps.append(radau.residual(at.moments("f"), part, x, u, h / substeps, *now))
+            return part
+
+        end, cost = radau.radau_cost(given, at.moments("L_soft" if soft else "L"), at.x, at.u, h, substeps, t)
+        return at.function("collocated", {"end": end, "cost": cost, "residual": ca.vertcat(*gaps)}, h=h, z=z)
+
+    def radau_path(self, substeps: int = 1) -> ca.Function:
+        """(x, u[, t][, p], h) -> z [substeps s nx], the stages of an interval's steps; NaN where none are found."""
+        at = self.stage_in_MX
+        h, found = at.sym("h"), list[Any]()
+        solve = at.radau_stages(h / substeps)
+
+        def kept(*values: Any) -> Any:
+            found.append(solve(*values))
+            return found[-1]
+
+        radau.radau_cost(kept, at.moments("L"), at.x, at.u, h, substeps, at.symbols.get(TIME))
+        return at.function("path", {"z": ca.vertcat(*found)}, h=h)
+
+    @cached_property
+    def radau_residual(self) -> ca.Function:
+        """(z [s nx], x, u[, t][, p], h) -> 0 where x + z are the states at the stages of a Radau step of length h."""
+        at = self.stage
+        z, h = at.sym("z", radau.STAGES * self.system.nx), at.sym("h")
+        residual = radau.residual(at.moments("f"), z, at.x, at.u, h, at.symbols.get(TIME))
+        return Arguments({"z": z}).given(**at.symbols).function("residual", {"residual": residual}, h=h)
+
+    @cached_property
+    def radau_stages(self) -> ca.Function:
+        """(x, u[, t][, p], h) -> z [s nx], found by Newton's method; NaN where that does not converge."""
+        at, unit = self.stage_in_MX, (self.system.ubx - self.system.lbx) / 2
+        h = at.sym("h")
+        return at.function("stages", {"z": radau.stages(self.radau_residual, unit, [*at.inputs, h])}, h=h)
 
 
 class Stage(Arguments):
@@ -268,18 +324,25 @@ class Stage(Arguments):
         """L + costate'f."""
         return (self.L_soft if soft else self.L) + ca.dot(costate, self.xdot)
 
-    def interval(self, h: Any, *, soft: bool = True, substeps: int = 1) -> tuple[Any, Any]:
-        """(x after a time h with u held, the integral of L or L_soft over it), by RK4 steps; their stages are at t,
-        t + h / 2 and t + h.
+    def interval(self, h: Any, *, soft: bool = True, substeps: int = 1, integrator: str = RK4) -> tuple[Any, Any]:
+        """(x after a time h with u held, the integral of L or L_soft over it), by RK4 steps, whose stages are at t,
+        t + h / 2 and t + h, or by Radau's (nocl/translate/radau.py), for which this is a stage in MX.
         """
-        of = self.functions
-        L, names = of.L_soft if soft else of.L, ["x", "u", *([TIME] if TIME in self.names else [])]
+        L, t = self.moments("L_soft" if soft else "L"), self.symbols.get(TIME)
+        if integrator == RADAU:
+            return radau.radau_cost(self.radau_stages(h / substeps), L, self.x, self.u, h, substeps, t)
+        return rk4_cost(self.moments("f"), L, self.x, self.u, h, substeps, t)
 
-        def at(function: ca.Function) -> Callable[..., Any]:
-            return lambda *values: self.given(**dict(zip(names, values, strict=True))).call(function)
+    def moments(self, name: str) -> Callable[..., Any]:
+        """A function of the problem's by its name, as one of (x, u[, t]), p being the stage's."""
+        function, names = getattr(self.functions, name), ["x", "u", *([TIME] if TIME in self.names else [])]
+        return lambda *values: self.given(**dict(zip(names, values, strict=True))).call(function)
 
-        t = self.symbols.get(TIME)
-        return rk4_cost(at(of.f), at(L), self.x, self.u, h, substeps, t)
+    def radau_stages(self, h: Any) -> Callable[..., Any]:
+        """(x, u[, t]) -> z of a Radau step of length h."""
+        names = ["x", "u", *([TIME] if TIME in self.names else [])]
+        solve = self.functions.radau_stages
+        return lambda *values: self.given(**dict(zip(names, values, strict=True)), h=h).call(solve)
 
     @property
     def of_system(self) -> list[Any]:

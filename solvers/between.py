@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from nocl.constraints import TOLERANCE
 from nocl.functions import Functions
+from nocl.substeps import RK4
 from nocl.support.checks import Array
 
 INSIDE = 8  # parts of an interval, at whose ends rows are looked at
@@ -27,12 +28,14 @@ CUTS = "; between nodes it may cut corners, margins there could not be held"  # 
 class Dips:
     """Those of the rows c [n] >= 0, in units of their scales, in a problem's own symbols; `without` [n] have none.
 
-    substeps : of an interval, in the plans
+    substeps, integrator : of an interval, in the plans
     """
 
-    def __init__(self, functions: Functions, c: ca.SX, without: NDArray[np.bool_], substeps: int) -> None:
+    def __init__(self, functions: Functions, c: ca.SX, without: NDArray[np.bool_], substeps: int,
+                 integrator: str = RK4) -> None:
         self.at, self.without = functions.arguments, without
-        self.step, self.c = functions.step(substeps=-(-substeps // INSIDE)), self.at.function("c", {"c": c})
+        self.step = functions.step(substeps=-(-substeps // INSIDE), integrator=integrator)
+        self.c = self.at.function("c", {"c": c})
         self.of_u = np.isin(np.arange(len(without)), ca.jacobian_sparsity(c, self.at["u"]).get_triplet()[0])
 
     def margins(self, t: Array, x: Array, u: Array, p: Array) -> Array:

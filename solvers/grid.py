@@ -1,4 +1,4 @@
-"""Whether Runge-Kutta steps are short enough: solutions held against the same equations on far shorter steps.
+"""Whether steps are short enough: solutions held against the same equations on far shorter steps.
 
 A solver knows its plant on its own grid alone. Where that is too coarse for a fast part of the plant, what it plans,
 and says that it costs, has nothing to do with the plant, and a descent even looks for such plans. So a few solutions
@@ -19,30 +19,32 @@ from nocl.functions import Functions
 from nocl.ocp import OCP
 from nocl.sampling import own_numbers
 from nocl.scales import usual_sizes
-from nocl.substeps import FINEST, REMEDY, Grid, grid_of
+from nocl.substeps import FEW, FINEST, RADAU, REMEDY, RK4, STABLE, TRIED, Grid, grid_of
 from nocl.support.checks import Array
 
 ROWS = 4  # solutions that are looked at
 APART = 0.1  # a plan that is off by more is none
+FINEST_IMPLICIT = 16  # steps in an interval taken for the truth where explicit ones are unstable even so
 SMALL = 1e-3  # of the usual cost: below it, errors count as shares of that
 Stages = dict[str, Array]  # x [n, nx], u [n, nu], t [n], p [n, np]
 
 
-def measured(ocp: OCP, functions: Functions, solution: Solution, substeps: int) -> Grid | None:
+def measured(ocp: OCP, functions: Functions, solution: Solution, substeps: int, integrator: str = RK4) -> Grid | None:
     """The grid of some solutions of an OCP under f, by the first ROWS that were solved; None where none was."""
     solution = solution[np.flatnonzero(solution.success)[:ROWS]]
     if not len(solution):
         return None
-    step, errors = float(np.diff(solution.t, axis=1).max()), _errors(ocp, functions, solution)
-    return grid_of(step, substeps, lambda n: float(errors(n).max()), fastest(functions, _stages(solution)))
+    step, errors = float(np.diff(solution.t, axis=1).max()), _errors(ocp, functions, solution, integrator)
+    return grid_of(step, substeps, lambda n: float(errors(n).max()), fastest(functions, _stages(solution)),
+                   tried=TRIED if integrator == RK4 else FEW, explicit=integrator == RK4)
 
 
-def followed(ocp: OCP, functions: Functions, solution: Solution, substeps: int) -> Solution:
+def followed(ocp: OCP, functions: Functions, solution: Solution, substeps: int, integrator: str = RK4) -> Solution:
     """The same, where a grid is too coarse: rows whose plan is off by more than APART have failed, and say so."""
     solved = np.flatnonzero(solution.success)
     if not len(solved):
         return solution
-    error = _errors(ocp, functions, solution[solved])(substeps)
+    error = _errors(ocp, functions, solution[solved], integrator)(substeps)
     lost, error = solved[error > APART], error[error > APART]
     said = [f"not solved: with substeps={substeps} plan and plant differ by {100 * e:.3g} %: a singularity on the way, "
             f"or {REMEDY}" for e in error]
@@ -64,30 +66,32 @@ def firsts(ocp: OCP) -> tuple[Array, Array]:
     return ocp.initial_states.sample(ROWS, own_numbers(0)), ocp.sample_parameters(ROWS, own_numbers(0, 2))
 
 
-def _errors(ocp: OCP, functions: Functions, s: Solution) -> Callable[[int], Array]:
+def _errors(ocp: OCP, functions: Functions, s: Solution, integrator: str) -> Callable[[int], Array]:
     """substeps -> the error of each row."""
     B, K, nx = len(s), s.u.shape[1], s.x.shape[2]
     x, h = s.x[:, :-1].reshape(-1, nx).T, np.diff(s.t, axis=1).reshape(1, -1)
-    step, moment = functions.step(), _stages(s)
+    moment = _stages(s)
     usual = usual_sizes(ocp)
     cost, slope = np.maximum(np.abs(s.cost), SMALL * usual.cost), s.V_x[:, 1:].reshape(-1, nx).T
     known: dict[int, Array] = {}
+    finest = (RK4, FINEST) if h.max() <= STABLE * FINEST * fastest(functions, moment) else (RADAU, FINEST_IMPLICIT)
+    steps = {kind: functions.step(integrator=kind) for kind in {integrator, finest[0]}}
 
-    def after(n: int) -> tuple[Array, Array]:
+    def after(kind: str, n: int) -> tuple[Array, Array]:
         z, total = x, np.zeros((1, B * K))
         for i in range(n):
             now = {**moment, "x": z.T, "t": moment["t"] + (i * h / n).ravel()}
-            z, part = (v.full() for v in step(*functions.arguments.columns(**now), h / n))
+            z, part = (v.full() for v in steps[kind](*functions.arguments.columns(**now), h / n))
             total = total + part
         return z, total
 
     with np.errstate(all="ignore"):
-        true, paid = after(FINEST)
+        true, paid = after(*finest)
 
     def error(n: int) -> Array:
         if n not in known:
             with np.errstate(all="ignore"):
-                z, total = after(n)
+                z, total = after(integrator, n)
                 off = np.abs(total - paid).ravel() + np.abs((slope * (z - true)).sum(axis=0))
                 parted = (np.abs(z - true) / usual.x[:, None]).max(axis=0).reshape(B, K).max(axis=1)
                 worst = np.maximum(off.reshape(B, K).sum(axis=1) / cost, parted)

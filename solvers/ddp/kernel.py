@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 from nocl.functions import Stage
 from nocl.ocp import OCP
-from nocl.scales import units
+from nocl.scales import units, usual_sizes
 from nocl.solvers.ddp.constraints import ConstraintRows, rows_source
+from nocl.substeps import RADAU, RK4
 from nocl.support.checks import Array
+from nocl.translate import radau
 from nocl.translate.kernels import emit
 
 STRAIGHT = 5_000  # products in the chain rule through a step, up to which it is straight-line code
@@ -37,10 +39,11 @@ def pack_weights(net: Any) -> Array:
     return np.concatenate([np.zeros(1), *(p.detach().double().cpu().numpy().ravel() for p in parts)])
 
 
-def ddp_source(ocp: OCP, net: Any = None, substeps: int = 1, rows: ConstraintRows | None = None) -> str:
+def ddp_source(ocp: OCP, net: Any = None, substeps: int = 1, rows: ConstraintRows | None = None,
+               integrator: str = RK4) -> str:
     """The generated part of the kernel: what csrc/ddp.h lists, for the exact f or for f_theta's FeatureNet.
 
-    substeps : Runge-Kutta steps in each interval
+    substeps, integrator : steps in each interval, and of which kind
     rows : constraints that are held by multipliers; None: they enter by the OCP's penalty
     """
     at = ocp.functions.stage
@@ -54,18 +57,31 @@ def ddp_source(ocp: OCP, net: Any = None, substeps: int = 1, rows: ConstraintRow
     moment = list(inputs.values())
     lines = ['#include "lanes.h"', *(['#include "mlp.h"'] if nets else []),
              *(f"#define {name} {value}" for name, value in sizes.items()),
-             f"static const double DAMPED[M] = {{{', '.join(map(repr, damped(ocp).tolist()))}}};", _STEP,
+             f"static const double DAMPED[M] = {{{', '.join(map(repr, damped(ocp).tolist()))}}};",
+             _radau(ocp) if integrator == RADAU else _STEP,
              _networks(inputs, nets),
              emit("field", [*moment, networks], [ca.densify(stage.rhs)]),
              emit("stage_jacobian", [*moment, networks], [stage.J.T]),
              emit("network_weights", [*moment, networks, stage.mu], [stage.v]),
              emit("stage_hessian", [*moment, networks, stage.bend, stage.mu], [stage.W]),
-             _chain(n, m, stage.J.sparsity(), stage.W.sparsity())]
+             (_patterns if integrator == RADAU else _chain)(n, m, stage.J.sparsity(), stage.W.sparsity())]
     if ocp.np:
         lines.append(emit("stage_parameters", [*moment, networks, stage.bend, stage.mu], [stage.by_p]))
     held = [] if rows is None else rows_source(ocp, rows, inputs)
     lines += [*_terminal(ocp, inputs), *held, '#include "ddp.h"\n']
     return "\n".join(lines)
+
+
+def _radau(ocp: OCP) -> str:
+    """The scheme of implicit steps, as csrc/radau.h reads it."""
+    unit, (rows, columns) = usual_sizes(ocp).x, radau.WEIGHT.shape
+    return "\n".join(["#define NZ (N + M)", f"#define STAGES {rows}", f"#define NEWTON {radau.ITERATIONS}",
+                      _numbers(f"reach[{columns}]", radau.REACH), _numbers("UNIT[N]", unit),
+                      _numbers(f"weight[{rows}][{columns}]", radau.WEIGHT), ""])
+
+
+def _numbers(name: str, values: Array) -> str:
+    return f"static const double {name} = {str(values.tolist()).replace('[', '{').replace(']', '}')};"
 
 
 def damped(ocp: OCP) -> Array:
@@ -178,16 +194,33 @@ def _dense(pattern: ca.Sparsity) -> NDArray[np.bool_]:
     return dense
 
 
-def _looped_chain(n: int, m: int, J: ca.Sparsity, W: ca.Sparsity, S: NDArray[np.bool_]) -> str:
-    """The tables that csrc/chain.h reads, and itself."""
+def _patterns(n: int, m: int, J: ca.Sparsity, W: ca.Sparsity) -> str:
+    """The tables that csrc/radau.h reads."""
+    whole, at = _whole(W)
+    return "\n".join([*_rows_of("J", _dense(J)), *_rows_of("W", whole), at, ""])
+
+
+def _whole(W: ca.Sparsity) -> tuple[NDArray[np.bool_], str]:
+    """The pattern of a stage's Hessian, both triangles, and the table of places among the nonzeros of the lower one."""
     number = np.full(W.shape, -1)
     rows, columns = W.get_triplet()
     number[rows, columns] = number[columns, rows] = np.arange(W.nnz())
-    whole = number >= 0
+    return number >= 0, _table("W_AT", number[number >= 0])
+
+
+def _rows_of(name: str, pattern: NDArray[np.bool_]) -> list[str]:
+    """The tables of a pattern, row by row."""
+    return [_table(f"{name}_ROW", np.r_[0, np.cumsum(pattern.sum(axis=1))]),
+            _table(f"{name}_COL", np.nonzero(pattern)[1])]
+
+
+def _looped_chain(n: int, m: int, J: ca.Sparsity, W: ca.Sparsity, S: NDArray[np.bool_]) -> str:
+    """The tables that csrc/chain.h reads, and itself."""
+    whole, at = _whole(W)
     T = whole.astype(int) @ S.astype(int) > 0
-    lines = [_table(f"{name}_{part}", values) for name, pattern in (("J", _dense(J)), ("W", whole), ("S", S), ("T", T))
-             for part, values in (("ROW", np.r_[0, np.cumsum(pattern.sum(axis=1))]), ("COL", np.nonzero(pattern)[1]))]
-    return "\n".join([*lines, _table("W_AT", number[whole]), f"#define S_ROW_END {S.sum()}", '#include "chain.h"', ""])
+    lines = [line for name, pattern in (("J", _dense(J)), ("W", whole), ("S", S), ("T", T))
+             for line in _rows_of(name, pattern)]
+    return "\n".join([*lines, at, f"#define S_ROW_END {S.sum()}", '#include "chain.h"', ""])
 
 
 def _table(name: str, values: NDArray[np.int64]) -> str:

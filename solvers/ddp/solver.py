@@ -38,7 +38,7 @@ from nocl.solvers.ddp.without_compiler import ddp_kernel
 from nocl.solvers.ddp.work import CONVERGED, GROWTH, DDPSettings, Work
 from nocl.solvers.grid import fastest_at_start, firsts, followed, measured
 from nocl.solvers.starts import middle, random_start
-from nocl.substeps import COARSE, Grid, settled
+from nocl.substeps import COARSE, INTEGRATORS, RK4, Grid, Steps, settled
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
@@ -60,8 +60,11 @@ class DDP:
     intervals : int
         K, the number of held controls on [t0, T].
     substeps : int, optional
-        RK4 steps in each interval. Default: 1, or where a few solutions from the OCP's initial states show that this is
+        Steps in each interval. Default: 1, or where a few solutions from the OCP's initial states show that this is
         too coarse for the plant, as many as they ask for (nocl/substeps.py); a warning says so.
+    integrator : "rk4" or "radau", optional
+        Explicit Runge-Kutta steps, or implicit ones (Radau IIA, 3 stages), which stiff systems need. Default: implicit
+        where substeps are left to nocl too, and explicit ones would be many; the warning says so.
     dynamics : LearnedDynamics, optional
         f_theta in place of the exact f; its networks' derivatives are generated C too.
     constraints : "hard", "elastic" or "soft"
@@ -84,7 +87,7 @@ class DDP:
     (nocl/solvers/ddp/smoothing.py) where the horizon is a number; costs are those of the problem without it.
     """
 
-    def __init__(self, ocp: OCP, *, intervals: int = 80, substeps: int | None = None,
+    def __init__(self, ocp: OCP, *, intervals: int = 80, substeps: int | None = None, integrator: str | None = None,
                  dynamics: LearnedDynamics | None = None, settings: DDPSettings | None = None,
                  constraints: str = "hard", between: bool | None = None, threads: int | None = None,
                  cache: str | os.PathLike[str] | None = None, rows: ConstraintRows | None = None) -> None:
@@ -92,6 +95,8 @@ class DDP:
         for name, value in (("intervals", intervals), ("substeps", 1 if substeps is None else substeps),
                             ("threads", 1 if threads is None else threads)):
             checks.whole(value, name, "DDP", 1)
+        if integrator is not None:
+            checks.word(integrator, INTEGRATORS, "integrator", "DDP")
         checks.word(constraints, ("hard", "elastic", "soft"), "constraints", "DDP")
         if constraints == "soft":
             ocp.refuse_constraints("DDP with constraints='soft'", "take constraints='hard', or solve it by NMPC")
@@ -111,12 +116,15 @@ class DDP:
         self.evaluations: Counter[str] = Counter()  # of f in this process, one for each state: "rollout", "backward"
         net = None if dynamics is None else _fitting(ocp, dynamics)
         self._weights = np.zeros(1) if net is None else pack_weights(net)
-        self.substeps = int(substeps or substeps_for(ocp, dynamics, self.intervals))
+        self.integrator, self.substeps = \
+            Steps(integrator or RK4, int(substeps)) if substeps else \
+            steps_for(ocp, dynamics, self.intervals, COARSE, integrator)
         self._own_rows = rows is not None
         given = rows_of(self.posed) if rows is None else rows
         self.rows = ConstraintRows() if constraints == "soft" else given
         self.held = self.rows.count(self.intervals)  # how many rows a plan has that multipliers hold
-        self.kernel = ddp_kernel(self.posed, dynamics, cache, self.substeps, self._multiplied)
+        self.kernel = ddp_kernel(self.posed, dynamics, cache, self.substeps, self._multiplied,
+                                 self.integrator)
         self._lb, self._ub = np.ascontiguousarray(ocp.system.lbu), np.ascontiguousarray(ocp.system.ubu)
 
     @cached_property
@@ -135,10 +143,10 @@ class DDP:
         if self._own_rows:
             raise ValueError("a DDP that was given rows of its own cannot go to another process, whose symbols differ; "
                              "expected the constraints of its problem: leave `rows` out, or use workers of this one")
-        return {"ocp": self.ocp, "intervals": self.intervals, "substeps": self.substeps, "dynamics": self.dynamics,
-                "settings": self.settings, "constraints": self.constraints, "between": self.between,
-                "threads": self.threads, "cache": self.cache, "margin": self.margin,
-                **({"weights": self.weights} if self.smoothed else {})}
+        return {"ocp": self.ocp, "intervals": self.intervals, "substeps": self.substeps,
+                "integrator": self.integrator, "dynamics": self.dynamics, "settings": self.settings,
+                "constraints": self.constraints, "between": self.between, "threads": self.threads, "cache": self.cache,
+                "margin": self.margin, **({"weights": self.weights} if self.smoothed else {})}
 
     def __setstate__(self, options: dict[str, Any]) -> None:
         found: dict[str, Any] = {name: options.pop(name) for name in ("margin", "weights") if name in options}
@@ -192,11 +200,12 @@ class DDP:
         functions = _functions(self.ocp, self.dynamics)
         if not self.checked and solution.success.any():
             self.checked = True
-            grid = measured(self.ocp, functions, solution, self.substeps)
+            grid = measured(self.ocp, functions, solution, self.substeps, self.integrator)
             self.coarse = grid is not None and grid.coarse
             if self.coarse:
                 warnings.warn(f"DDP of {self.ocp.system.name}: {grid}", stacklevel=3)
-        return followed(self.ocp, functions, solution, self.substeps) if self.coarse and self.left else solution
+        lost = self.coarse and self.left
+        return followed(self.ocp, functions, solution, self.substeps, self.integrator) if lost else solution
 
     def descend(self, batch: Piece) -> Solution:
         """Solve one piece of a batch, here."""
@@ -255,7 +264,8 @@ class DDP:
     @property
     def _dips(self) -> Dips:
         stage = self.rows.stage
-        return Dips(_functions(self.posed, self.dynamics), stage.c, stage.equal, self.substeps)
+        return Dips(_functions(self.posed, self.dynamics), stage.c, stage.equal, self.substeps,
+                    self.integrator)
 
     def looked_at(self, known: Solution) -> Solution:
         """Solutions of this problem on this grid, with `cut` where this solver holds constraints between nodes."""
@@ -333,7 +343,7 @@ class DDP:
     def key(self) -> str:
         """A fingerprint of the problem, the model and the settings."""
         net = None if self.dynamics is None else self.dynamics.net
-        source = ddp_source(self.posed, net, self.substeps, self._multiplied)
+        source = ddp_source(self.posed, net, self.substeps, self._multiplied, self.integrator)
         return fingerprint(self.ocp.to_data(), source, self._weights, self.intervals, self.settings, self.constraints,
                            *([self.between] if self.between else []), *([] if self.margin is None else [self.margin]),
                            version("nocl"))
@@ -370,30 +380,40 @@ def _posed(ocp: OCP, smoothed: bool) -> OCP:
     return regularised(ocp) if smoothed else ocp
 
 
-@lru_cache(maxsize=32)
 def substeps_for(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int, tolerance: float = COARSE) -> int:
-    """As many as solutions from a few initial states ask for, so that they are off by `tolerance` at most."""
+    """As many RK4 steps as solutions from a few initial states ask for, so that they are off by `tolerance` at most."""
+    return steps_for(ocp, dynamics, intervals, tolerance, RK4).substeps
+
+
+@lru_cache(maxsize=32)
+def steps_for(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int, tolerance: float = COARSE,
+              integrator: str | None = None) -> Steps:
+    """The steps that solutions from a few initial states ask for, so that they are off by `tolerance` at most.
+
+    integrator : of these steps alone; None: RK4, or implicit ones where it would take many of those
+    """
     free = ocp.is_free  # without its constraints a horizon would be as short as it may be
     tried = ocp if ocp.states_only or free else ocp.unconstrained  # a few descents, to see how fast the plant is
     functions, (x0, p) = _functions(tried, dynamics), firsts(ocp)
 
-    def solved(substeps: int) -> Solution:
-        ddp = DDP(tried, intervals=intervals, substeps=substeps, dynamics=dynamics,
+    def solved(steps: Steps) -> Solution:
+        ddp = DDP(tried, intervals=intervals, substeps=steps.substeps, integrator=steps.integrator, dynamics=dynamics,
                   constraints="hard" if free else "soft")
         ddp.checked = True
         return ddp.solve(x0, p=p, progress=False) if ocp.has_goal else _best_of_few(ddp, x0, p)
 
-    def ask(substeps: int) -> Grid | None:
-        found = solved(substeps) if ocp.has_goal else fine()
-        return measured(tried, functions, found, substeps)
+    def ask(steps: Steps) -> Grid | None:
+        found = solved(steps) if ocp.has_goal else fine()
+        return measured(tried, functions, found, steps.substeps, steps.integrator)
 
     @cache
     def fine() -> Solution:
         """Without a goal optima may be where a coarse grid has none: those of a fine one are asked about."""
-        return solved(FIRST)
+        return solved(Steps(substeps=FIRST))
 
     step = (middle(ocp.horizon) if free else ocp.horizon) / intervals
-    return settled(f"DDP of {ocp.system.name}", ask, step, lambda: fastest_at_start(ocp, functions), tolerance)
+    return settled(f"DDP of {ocp.system.name}", ask, step, lambda: fastest_at_start(ocp, functions), tolerance,
+                   integrator)
 
 
 def _best_of_few(ddp: DDP, x0: Array, p: Array) -> Solution:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from nocl.ocp import OCP
 from nocl.solvers.ddp.constraints import Block, ConstraintRows, RowModel, parameters
 from nocl.solvers.ddp.kernel import damped, ddp_source
+from nocl.substeps import RK4
 from nocl.support.checks import Array
 from nocl.support.compiler import NoCompilerError
 from nocl.translate.arguments import Arguments
@@ -26,14 +27,15 @@ Rows = NDArray[np.int64]
 Mask = NDArray[np.bool_]
 
 
-def ddp_kernel(ocp: OCP, dynamics: Any, cache: str | os.PathLike[str] | None,
-               substeps: int = 1, rows: ConstraintRows | None = None) -> Kernel | NumpyKernel:
+def ddp_kernel(ocp: OCP, dynamics: Any, cache: str | os.PathLike[str] | None, substeps: int = 1,
+               rows: ConstraintRows | None = None, integrator: str = RK4) -> Kernel | NumpyKernel:
     """The compiled kernel, or its twin, with a warning said once, where there is no compiler."""
     try:
-        return Kernel(ddp_source(ocp, None if dynamics is None else dynamics.net, substeps, rows), cache)
+        net = None if dynamics is None else dynamics.net
+        return Kernel(ddp_source(ocp, net, substeps, rows, integrator), cache)
     except NoCompilerError as error:
         say_once(f"{error}. DDP goes on in CasADi's virtual machine and numpy, with the same numbers, much slower")
-        return NumpyKernel(ocp, dynamics, substeps, rows)
+        return NumpyKernel(ocp, dynamics, substeps, rows, integrator)
 
 
 @lru_cache
@@ -46,17 +48,19 @@ class NumpyKernel:
 
     width = 1
 
-    def __init__(self, ocp: OCP, dynamics: Any = None, substeps: int = 1, rows: ConstraintRows | None = None) -> None:
+    def __init__(self, ocp: OCP, dynamics: Any = None, substeps: int = 1, rows: ConstraintRows | None = None,
+                 integrator: str = RK4) -> None:
         of = ocp.functions if dynamics is None else ocp.functions.on(dynamics.to_casadi())
-        at, self.shape = of.stage, (ocp.system.nx, ocp.system.nu)
+        at, self.shape = of.stage_of(integrator), (ocp.system.nx, ocp.system.nu)
         self.np, self.timed, self.end = ocp.np, ocp.uses_time, of.end
         self.has_data = bool(self.np or self.timed)
         h, lam = at.sym("h"), at.sym("lam", ocp.system.nx)
-        after, cost = at.interval(h, soft=rows is None, substeps=substeps)
+        after, cost = at.interval(h, soft=rows is None, substeps=substeps, integrator=integrator)
         H, g = ca.hessian(ca.dot(lam, after) + cost, at.z)[0], ca.gradient(cost, at.z)
         self.rows = None if rows is None else NumpyRows(ocp, rows)
         self.damped = np.diag(damped(ocp))
-        self._step, self._terminal = of.step(soft=rows is None, substeps=substeps), of.G_derivatives
+        self._step = of.step(soft=rows is None, substeps=substeps, integrator=integrator)
+        self._terminal = of.G_derivatives
         by_p = {"Q_p": ca.gradient(ca.dot(lam, after) + cost, at["p"])} if self.np else {}
         self._slopes = at.function("slopes", {"cost": cost, "F_z": ca.jacobian(after, at.z), "cost_z": g, "Q_zz": H,
                                               **by_p}, h=h, lam=lam)

@@ -18,12 +18,14 @@ from nocl.scales import usual_sizes
 from nocl.solvers.ddp.batch import Rows
 from nocl.solvers.ddp.constraints import ConstraintRows
 from nocl.solvers.ddp.without_compiler import NumpyKernel
+from nocl.substeps import RADAU, RK4
 from nocl.support.checks import Array
 from nocl.support.fields import Checked, count, positive
+from nocl.translate import radau
 from nocl.translate.kernels import Kernel
 
 ROUNDING = 1e-15  # of the usual cost
-STAGES = 4  # evaluations of f in an RK4 step
+STAGES = {RK4: 4, RADAU: radau.STAGES}  # of a step: evaluations of f, in an implicit one for each Newton iteration
 GROWTH, DECAY = 4.0, 2.0  # of mu, after a failure and a success: against 8 and 8, twice as many wild starts converge
 
 
@@ -52,6 +54,7 @@ class Kernels(Protocol):
     posed: OCP  # what the kernel solves
     intervals: int
     substeps: int
+    integrator: str
     settings: DDPSettings
     constraints: str
     rows: ConstraintRows
@@ -107,7 +110,7 @@ class Work:
 
     def rollout(self, rows: Rows, x_bar: Array, u_bar: Array, gain: Array) -> None:
         d = self.ddp
-        d.evaluations["rollout"] += STAGES * d.substeps * d.intervals * len(rows)
+        d.evaluations["rollout"] += STAGES[d.integrator] * d.substeps * d.intervals * len(rows)
         d.kernel("nocl_rollout", rows, d.intervals, d._weights, d._lb, d._ub, self.h, *self.data, self._start(), x_bar,
                  u_bar, self.k, gain, self.alpha, self.new_x, self.new_u, self.new_J, *self._held_in(),
                  *self._held_out(), threads=d.threads)
@@ -119,7 +122,8 @@ class Work:
     def backward(self, rows: Rows, V: Array | None = None, V_x: Array | None = None, V_xx: Array | None = None,
                  V_p: Array | None = None) -> None:
         d = self.ddp
-        d.evaluations["backward"] += STAGES * d.substeps * d.intervals * len(rows)  # with first and second derivatives
+        each = STAGES[d.integrator] * d.substeps * d.intervals  # with first and second derivatives
+        d.evaluations["backward"] += each * len(rows)
         by_p = [V_p] if self.data else []
         d.kernel("nocl_backward", rows, d.intervals, d._weights, d._lb, d._ub, self.h, *self.data, self.x, self.u,
                  self.mu, self.k, self.gain, self.slope, self.curve, self.positive, V, V_x, V_xx, *by_p,
@@ -242,7 +246,15 @@ class Work:
 
     def _messages(self, t: Array) -> list[str]:
         """What came of each problem, in words; t [B, K+1]."""
-        return [self._words(int(state)) for state in self.state]
+        return [self._where_lost(row) if state == BLEW_UP and self.ddp.integrator == RADAU else self._words(int(state))
+                for row, state in enumerate(self.state)]
+
+    def _where_lost(self, row: int) -> str:
+        """Of a starting guess that implicit steps cannot follow."""
+        lost = np.flatnonzero(~np.isfinite(self.x[row]).all(axis=1))
+        if not lost.size:
+            return MESSAGES[BLEW_UP]
+        return f"{MESSAGES[BLEW_UP]}: the implicit step did not converge at node {lost[0] - 1}; give more substeps"
 
     def _words(self, state: int) -> str:
         kinks = self.ddp.posed.not_smooth if state in (OUT_OF_ITERATIONS, NO_DESCENT, NOT_CONVEX) else ""

@@ -48,7 +48,7 @@ class Derivatives:
         return self._stage(second=True)
 
     def _stage(self, second: bool) -> ca.Function:
-        p, at = self.program, self.program.functions.stage
+        p, at = self.program, self.program.functions.stage_of(self.program.integrator)
         h, costate = at.sym("h"), at.sym("costate", p.ocp.system.nx)
         end, cost = at.given(h=h).call(p.step)
         Q_zz, Q_z = ca.hessian(cost + ca.dot(costate, end), at.z)

@@ -30,7 +30,7 @@ from nocl.solvers.nmpc.tasks import Outcome, Task, attempt, failure, outside, so
 from nocl.solvers.nmpc.transcription import BACKENDS, Answer, Transcription
 from nocl.solvers.search import Found, Moves, Rows, Search
 from nocl.solvers.starts import middle
-from nocl.substeps import Grid, settled
+from nocl.substeps import INTEGRATORS, RADAU, RK4, Grid, Steps, settled
 from nocl.support import checks, compiler
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
@@ -50,8 +50,10 @@ class NMPC:
     intervals : N
     dynamics : casadi.Function (x, u[, t][, p]) -> xdot, or an object with `to_casadi()`; default: the exact f
     solver : "fatrop" (fast) or "ipopt" (reference); another nlpsol of CasADi's by its name
-    substeps : RK4 steps in each interval; default: 1, or where the first solutions show that this is too coarse for the
+    substeps : steps in each interval; default: 1, or where the first solutions show that this is too coarse for the
         plant, as many as they ask for (nocl/substeps.py); a warning says so
+    integrator : "rk4", or "radau" for implicit steps (Radau IIA, 3 stages), whose stages are variables of the program;
+        default: implicit where substeps are left to nocl too, and explicit ones would be many
     horizon : length of the window that is optimised, at most the OCP's horizon T (default); it ends at T at the latest
     terminal : cost at the window's end in place of G: a casadi.Function (x), (x, t) or (x, t, p) -> number, or an
         object with `value_to_casadi()`, such as a trained value function
@@ -83,6 +85,7 @@ class NMPC:
     dynamics: Any = field(default=None, kw_only=True)
     solver: str = field(default="fatrop", kw_only=True)
     substeps: int | None = field(default=None, kw_only=True)
+    integrator: str | None = field(default=None, kw_only=True)
     horizon: float | None = field(default=None, kw_only=True)
     terminal: Any = field(default=None, kw_only=True)
     starts: int = field(default=8, kw_only=True)
@@ -101,6 +104,8 @@ class NMPC:
         for name, least in (("intervals", 2), ("substeps", 1), ("starts", 1), ("passes", 0), ("neighbours", 1)):
             if name != "substeps" or self.substeps is not None:
                 checks.whole(getattr(self, name), name, "NMPC", least)
+        if self.integrator is not None:
+            checks.word(self.integrator, INTEGRATORS, "integrator", "NMPC")
         checks.whole(self.seed, "seed", "NMPC", most=2**63)
         checks.word(self.constraints, ("hard", "soft"), "constraints", "NMPC")
         checks.flag(self.between, "between", "NMPC")
@@ -156,7 +161,8 @@ class NMPC:
         options = sorted((self.options or {}).items())
         return fingerprint(self.ocp.to_data(), self.dynamics, self.terminal,
                            int(self.intervals), int(self.substeps or 0), self.constraints, self.solver, options,
-                           *([list(self.soft)] if self.soft else []), *([self.between] if self.between else []))
+                           *([list(self.soft)] if self.soft else []), *([self.between] if self.between else []),
+                           *([self.integrator] if self.integrator == RADAU else []))
 
     @property
     def program(self) -> Transcription:
@@ -169,16 +175,32 @@ class NMPC:
 
     @property
     def settled(self) -> NMPC:
-        """This one, its substeps a number: those that its solutions so far have asked for, 1 before there are any."""
-        return self if self.substeps is not None else self._with(self._with(1)._program.settled.get("substeps", 1))
+        """This one, its steps given: those that its solutions so far have asked for, before there are any the first
+        that are tried."""
+        return self if self.substeps is not None else self._with(self._known.get("steps", self._begin))
 
-    def _with(self, substeps: int) -> NMPC:
-        if substeps not in self._others:
-            self._others[substeps] = replace(self, substeps=substeps)
-        return self._others[substeps]
+    @property
+    def _begin(self) -> Steps:
+        """What is tried first."""
+        return Steps(self.integrator or RK4)
+
+    @property
+    def _known(self) -> dict[str, Any]:
+        """What solutions have shown: `steps` that they ask for, and whether the grid is still `coarse` with them."""
+        found: dict[str, Any] = self._first._program.settled.setdefault(self.integrator or "chosen", {})
+        return found
+
+    @property
+    def _first(self) -> NMPC:
+        return self._with(self._begin)
+
+    def _with(self, steps: Steps) -> NMPC:
+        if steps not in self._others:
+            self._others[steps] = replace(self, substeps=steps.substeps, integrator=steps.integrator)
+        return self._others[steps]
 
     @cached_property
-    def _others(self) -> dict[int, NMPC]:
+    def _others(self) -> dict[Steps, NMPC]:
         return {}
 
     @property
@@ -244,37 +266,38 @@ class NMPC:
         In a folder all that is asked there begins with 1, so that the same call finds what it left. Where nothing was
         solved, more substeps are first tried on a few states, from one start each.
         """
-        known = self._with(1)._program.settled
-        if "substeps" in known and call.out is None:
+        known = self._known
+        if "steps" in known and call.out is None:
             solution = self.settled._search(call)
-            return self._followed(solution, known["substeps"]) if known["coarse"] else solution
-        functions, step = self._with(1)._program.functions, float(np.diff(call.t).max())
-        found, grids = dict[int, Solution](), dict[int, Grid | None]()
+            return self._followed(solution, known["steps"]) if known["coarse"] else solution
+        functions, step = self._first._program.functions, float(np.diff(call.t).max())
+        found, grids = dict[Steps, Solution](), dict[Steps, Grid | None]()
 
-        def ask(substeps: int) -> Grid | None:
-            finer = self._with(substeps)
+        def ask(steps: Steps) -> Grid | None:
+            finer = self._with(steps)
             hope = not found or any(s.success.any() for s in found.values())
             if not hope and not finer._search(call.few()).success.any():
                 return None
-            s = found[substeps] = finer._search(call.within(substeps))
-            grids[substeps] = measured(self.ocp, functions, s, substeps)
-            return grids[substeps]
+            s = found[steps] = finer._search(call.within(steps))
+            grids[steps] = measured(self.ocp, functions, s, *reversed(steps))
+            return grids[steps]
 
-        substeps = settled(f"NMPC of {self.ocp.system.name}", ask, step, lambda: fastest_at_start(self.ocp, functions))
-        grid = grids[substeps]
+        steps = settled(f"NMPC of {self.ocp.system.name}", ask, step, lambda: fastest_at_start(self.ocp, functions),
+                        integrator=self.integrator)
+        grid = grids[steps]
         if any(s.success.any() for s in found.values()):
-            known.update(substeps=substeps, coarse=grid is not None and grid.coarse)
-        return self._followed(found[substeps], substeps) if grid is not None and grid.coarse else found[substeps]
+            known.update(steps=steps, coarse=grid is not None and grid.coarse)
+        return self._followed(found[steps], steps) if grid is not None and grid.coarse else found[steps]
 
-    def _followed(self, solution: Solution, substeps: int) -> Solution:
-        return followed(self.ocp, self._with(1)._program.functions, solution, substeps)
+    def _followed(self, solution: Solution, steps: Steps) -> Solution:
+        return followed(self.ocp, self._first._program.functions, solution, *reversed(steps))
 
     def _told(self, solution: Solution) -> Solution:
         """The same; a warning, once for each program, where the first solutions show a grid that is too coarse."""
         p = self.program
         if "told" not in p.settled and solution.success.any():
             p.settled["told"] = True
-            grid = measured(self.ocp, p.functions, solution, p.substeps)
+            grid = measured(self.ocp, p.functions, solution, p.substeps, p.integrator)
             if grid is not None and grid.coarse:
                 warnings.warn(f"NMPC of {self.ocp.system.name}: {grid}", stacklevel=3)
         return solution
@@ -374,7 +397,7 @@ def shared_program(recipe: _Recipe) -> Transcription:
     m = recipe.nmpc
     return Transcription(m.ocp, dynamics_function(m.ocp, m.dynamics), int(m.intervals), int(m.substeps or 1),
                          m.constraints == "soft", m.solver, tuple(sorted((m.options or {}).items())), m.terminal,
-                         None if m._folder is None else (m.key, m._folder), tuple(m.soft))
+                         None if m._folder is None else (m.key, m._folder), tuple(m.soft), m.integrator or RK4)
 
 
 @lru_cache(maxsize=KEPT)
@@ -415,9 +438,12 @@ class _Call:
     out: Path | None
     show: bool
 
-    def within(self, substeps: int) -> _Call:
-        """The same, what it keeps in a folder of its own for more substeps than 1."""
-        return self if substeps == 1 or self.out is None else replace(self, out=self.out / f"substeps-{substeps}")
+    def within(self, steps: Steps) -> _Call:
+        """The same, what it keeps in a folder of its own for other steps than one of Runge and Kutta's."""
+        if steps == Steps() or self.out is None:
+            return self
+        kind = "" if steps.integrator == RK4 else f"-{steps.integrator}"
+        return replace(self, out=self.out / f"substeps-{steps.substeps}{kind}")
 
     def few(self) -> _Call:
         """At most PROBES of its states, from their guesses and one start each; nothing is kept in a folder."""

@@ -3,8 +3,9 @@
 Variables w = [x_0, u_0, x_1, u_1, ..., x_N], parameters p = [x_0, h_0, ..., h_{N-1}, t_N], the lengths of the
 intervals and the time of the last node, then the parameters of the problem.
 Constraints, stage by stage: x_{k+1} - F(x_k, u_k; h_k) = 0, then x_0 - p = 0 at k = 0 and the problem's own
-(held.py). A free horizon T stands behind the state of each node, T_{k+1} = T_k, and h_k are then shares of it. A soft
-constraint has slacks behind u_k. A gap's multiplier is minus the costate of the node that it leads to:
+(held.py). Implicit steps have their stages z_k behind u_k: F is of (x_k, u_k, z_k), and their equations stand last. A
+free horizon T stands behind the state of each node, T_{k+1} = T_k, and h_k are then shares of it. A soft constraint has
+slacks behind u_k. A gap's multiplier is minus the costate of the node that it leads to:
 lambda_{k+1} = dJ*/dx_{k+1}.
 """
 
@@ -25,9 +26,11 @@ from nocl.ocp import OCP
 from nocl.scales import steps, units
 from nocl.solvers.between import Dips
 from nocl.solvers.nmpc.held import Block, Layout, layout
+from nocl.substeps import RADAU, RK4
 from nocl.support import compiler
 from nocl.support.checks import Array
 from nocl.support.guard import Guarded, NoAnswerError
+from nocl.translate import radau
 from nocl.translate.arguments import Arguments
 
 BACKENDS: dict[str, dict[str, Any]] = {
@@ -109,6 +112,7 @@ class Transcription:
     terminal: ca.Function | None = None  # (x), (x, t) or (x, t, p) -> cost at the last node; default: G
     compiled: tuple[str, Path] | None = None  # (the program's key, cache folder) of compiled functions; or interpreted
     eased: tuple[str, ...] = ()  # constraints that an exact penalty holds, by name
+    integrator: str = RK4
 
     @cached_property
     def functions(self) -> Functions:
@@ -145,10 +149,25 @@ class Transcription:
         """How many variables of a node the horizon is: T, the same at all nodes, where it is free."""
         return int(self.ocp.is_free)
 
+    @property
+    def inner(self) -> int:
+        """How many variables, and equations, the stages of an interval's steps are: 0 where those are explicit."""
+        return self.substeps * radau.STAGES * self.ocp.system.nx if self.integrator == RADAU else 0
+
     @cached_property
     def step(self) -> ca.Function:
         """(x, u[, t][, p], h) -> (x at the end of the interval, integral of L over it)."""
-        return self.functions.step(soft=self.soft, substeps=self.substeps)
+        return self.functions.step(soft=self.soft, substeps=self.substeps, integrator=self.integrator)
+
+    @cached_property
+    def _interval(self) -> ca.Function:
+        """(x, u[, t][, p], h[, z]) -> (end, cost[, residual]): as the program has it."""
+        return self.functions.collocated(soft=self.soft, substeps=self.substeps) if self.inner else self.step
+
+    @cached_property
+    def _path(self) -> ca.Function:
+        """(x, u[, t][, p], h) -> z."""
+        return self.functions.radau_path(self.substeps)
 
     @cached_property
     def rollout(self) -> ca.Function:
@@ -169,17 +188,19 @@ class Transcription:
         """x, p, f, g of the nonlinear program, in MX."""
         s, N, m = self.ocp.system, self.N, self.held.slacks
         X, U, S = ca.MX.sym("x", s.nx + self.free, N + 1), ca.MX.sym("u", s.nu, N), ca.MX.sym("slack", m, N + 1)
+        Z = ca.MX.sym("z", self.inner, N)
         p = ca.MX.sym("p", s.nx + N + 1 + self.ocp.np)
-        w = ca.vertcat(*(v for k in range(N) for v in (X[:, k], U[:, k], S[:, k])), X[:, N], S[:, N])
-        flat = ca.Function("flat", [X, U, S, p], [w, *self._cost_and_rows(X, U, S, p)])
+        w = ca.vertcat(*(v for k in range(N) for v in (X[:, k], U[:, k], S[:, k], Z[:, k])), X[:, N], S[:, N])
+        flat = ca.Function("flat", [X, U, S, Z, p], [w, *self._cost_and_rows(X, U, S, Z, p)])
         w_sym, scales = ca.MX.sym("w", w.numel()), self.scales
         _, cost, constraints = flat(*self._split(w_sym if scales.ordinary else w_sym * scales.w), p)
         if not scales.ordinary:
             cost, constraints = cost / scales.cost, constraints / scales.g
         return {"x": w_sym, "p": p, "f": cost, "g": constraints}
 
-    def _cost_and_rows(self, X: ca.MX, U: ca.MX, S: ca.MX, p: ca.MX) -> tuple[ca.MX, ca.MX]:
-        """(cost, g) of states [nx (+ T), N+1], controls [nu, N], slacks [slacks, N+1] and parameters."""
+    def _cost_and_rows(self, X: ca.MX, U: ca.MX, S: ca.MX, Z: ca.MX, p: ca.MX) -> tuple[ca.MX, ca.MX]:
+        """(cost, g) of states [nx (+ T), N+1], controls [nu, N], slacks [slacks, N+1], stages [inner, N], parameters.
+        """
         s, N = self.ocp.system, self.N
         h, end, own, x = p[s.nx: s.nx + N].T, p[s.nx + N], p[s.nx + N + 1:], X[:s.nx, :]
         t = self._times(h, end) if self.ocp.uses_time else end
@@ -187,12 +208,14 @@ class Transcription:
             T = X[s.nx, :]
             h, end, t = h * T[:N], T[N], t * (T if self.ocp.uses_time else T[N])
         stages = Arguments({"x": x[:, :-1], "u": U, "t": t[:, :-1], "p": ca.repmat(own, 1, N)})
-        ends, costs = self.step.map(N)(*(stages[name] for name in self.functions.arguments.names), h)
+        ends, costs, *inner = self._interval.map(N)(*(stages[name] for name in self.functions.arguments.names), h,
+                                                    *([Z] if self.inner else []))
         if self.free:
             ends = ca.vertcat(ends, X[s.nx, :-1])
         gaps, paths = ca.horzsplit(X[:, 1:] - ends), [ca.vertcat(x[:, 0] - p[: s.nx], *self._rows(0, x, U, S, t, own))]
         paths += [ca.vertcat(ca.MX(0, 1), *self._rows(k, x, U, S, t, own)) for k in range(1, N + 1)]
-        g = ca.vertcat(*(v for k in range(N) for v in (gaps[k], *paths[k: k + 1])), *paths[N:])
+        steps = [[zeros[:, k] for zeros in inner] for k in range(N)]
+        g = ca.vertcat(*(v for k in range(N) for v in (gaps[k], *paths[k: k + 1], *steps[k])), *paths[N:])
         cost = ca.sum2(costs) + self.end_cost(x[:, N], end, own)
         return (cost + self.held.weight * ca.sum1(ca.sum2(S)) if self.held.slacks else cost), g
 
@@ -221,19 +244,21 @@ class Transcription:
         """The sizes that the solver sees as 1, in steps of about a thousand: most problems are solved as they stand."""
         N, of = self.N, units(self.ocp)
         T, slacks = steps(np.full(self.free, self.ocp.longest)), np.ones(self.held.slacks)
-        w = np.r_[np.tile(np.r_[of.x, T, of.u, slacks], N), of.x, T, slacks]
+        inner = np.tile(of.x, self.inner // len(of.x))
+        w = np.r_[np.tile(np.r_[of.x, T, of.u, slacks, inner], N), of.x, T, slacks]
         rows = [[block.unit for block in self.held.at(k, N)] for k in range(N + 1)]
-        g = [of.x, T, of.x, *rows[0], *(part for k in range(1, N) for part in (of.x, T, *rows[k])), *rows[N]]
+        g = [of.x, T, of.x, *rows[0], inner,
+             *(part for k in range(1, N) for part in (of.x, T, *rows[k], inner)), *rows[N]]
         return Scales(w, np.concatenate(g), of.cost, of.x)
 
-    def _split(self, w: Any) -> tuple[Any, Any, Any]:
-        """(X [nx (+ T), N+1], U [nu, N], slacks [slacks, N+1]) of the interleaved variables."""
+    def _split(self, w: Any) -> tuple[Any, Any, Any, Any]:
+        """(X [nx (+ T), N+1], U [nu, N], slacks [slacks, N+1], Z [inner, N]) of the interleaved variables."""
         s, N = self.ocp.system, self.N
-        n, nu = s.nx + self.free, s.nu
-        size = n + nu + self.held.slacks
-        inner, last = ca.reshape(w[: size * N, :], size, N), w[size * N:, :]
-        return (ca.horzcat(inner[:n, :], last[:n, :]), inner[n: n + nu, :],
-                ca.horzcat(inner[n + nu:, :], last[n:, :]))
+        n, nu, slacks = s.nx + self.free, s.nu, self.held.slacks
+        size = n + nu + slacks + self.inner
+        first, last = ca.reshape(w[: size * N, :], size, N), w[size * N:, :]
+        x, u, slack, z = ca.vertsplit(first, np.cumsum([0, n, nu, slacks, self.inner]).tolist())
+        return ca.horzcat(x, last[:n, :]), u, ca.horzcat(slack, last[n:, :]), z
 
     @cached_property
     def solver(self) -> ca.Function:
@@ -261,8 +286,8 @@ class Transcription:
                    **BACKENDS.get(self.backend, {})}
         if self.backend == "fatrop":
             options |= {"structure_detection": "manual", "N": N, "nx": [s.nx + self.free] * (N + 1),
-                        "nu": [s.nu + m] * N + [m],
-                        "ng": [s.nx * (k == 0) + self.held.size(k, N) for k in range(N + 1)]}
+                        "nu": [s.nu + m + self.inner] * N + [m],
+                        "ng": [s.nx * (k == 0) + self.held.size(k, N) + self.inner * (k < N) for k in range(N + 1)]}
         try:
             return ca.nlpsol("nmpc", self.backend, problem, {**options, **dict(self.options)})
         except RuntimeError as error:
@@ -275,11 +300,13 @@ class Transcription:
         s, N, horizon, slacks = self.ocp.system, self.N, self.ocp.horizon, self.held.slacks
         any_x, T = np.full(s.nx, np.inf), [(horizon.low, horizon.high)] if self.free else []
         low, high = (np.array([pair[i] for pair in T]) for i in (0, 1))
-        lbx = [np.tile(np.r_[-any_x, low, s.lbu, np.zeros(slacks)], N), -any_x, low, np.zeros(slacks)]
-        ubx = [np.tile(np.r_[any_x, high, s.ubu, np.full(slacks, np.inf)], N), any_x, high, np.full(slacks, np.inf)]
+        any_z, none = np.full(self.inner, np.inf), np.zeros(self.inner)
+        lbx = [np.tile(np.r_[-any_x, low, s.lbu, np.zeros(slacks), -any_z], N), -any_x, low, np.zeros(slacks)]
+        ubx = [np.tile(np.r_[any_x, high, s.ubu, np.full(slacks, np.inf), any_z], N), any_x, high,
+               np.full(slacks, np.inf)]
         gap, rows = np.zeros(s.nx + self.free), [[b.upper for b in self.held.at(k, N)] for k in range(N + 1)]
-        ubg = np.concatenate([gap, np.zeros(s.nx), *rows[0],
-                              *(part for k in range(1, N) for part in (gap, *rows[k])), *rows[N]])
+        ubg = np.concatenate([gap, np.zeros(s.nx), *rows[0], none,
+                              *(part for k in range(1, N) for part in (gap, *rows[k], none)), *rows[N]])
         return {"lbx": np.concatenate(lbx) / self.scales.w, "ubx": np.concatenate(ubx) / self.scales.w,
                 "lbg": np.zeros(len(ubg)), "ubg": ubg}
 
@@ -293,6 +320,7 @@ class Transcription:
             parts += [np.zeros(nx * (k == 0) + (nx + self.free) * (0 < k < N))]
             parts += [np.zeros(len(block)) if block is held.end else block.inward(margin[k, of_rows[id(block)]])
                       for block in held.at(k, N)]
+            parts += [np.zeros(self.inner * (k < N))]
         return np.concatenate(parts)
 
     @cached_property
@@ -305,7 +333,7 @@ class Transcription:
         """Where x_0 - p and the gaps stand in g, [N+1, nx]."""
         s, N = self.ocp.system, self.N
         n = s.nx + self.free
-        stages = [n + self.held.size(k, N) + s.nx * (k == 0) for k in range(N)]
+        stages = [n + self.held.size(k, N) + s.nx * (k == 0) + self.inner for k in range(N)]
         first = np.r_[n, np.cumsum([0, *stages])[:N]].astype(np.int64)
         return first[:, None] + np.arange(s.nx)
 
@@ -316,7 +344,8 @@ class Transcription:
         x, T = [f"the dynamics of {name}" for name in s.state_names], ["the horizon"] * self.free
         held = [[block.rows.title(i) for block in self.held.at(k, N) for i in range(len(block))] for k in range(N + 1)]
         found = [(what, k + 1) for k in range(N) for what in (*x, *T)]
-        stages = [found[k * len(x + T):(k + 1) * len(x + T)] + [(what, k) for what in (*x * (k == 0), *held[k])]
+        inner = x * (self.inner // len(x))
+        stages = [found[k * len(x + T):(k + 1) * len(x + T)] + [(what, k) for what in (*x * (k == 0), *held[k], *inner)]
                   for k in range(N)]
         return [row for stage in stages for row in stage] + [(what, N) for what in held[N]]
 
@@ -349,9 +378,9 @@ class Transcription:
         return [0.0]  # seconds of the slowest solve that came back
 
     @cached_property
-    def settled(self) -> dict[str, int]:
-        """What its first solutions have shown once they were held against the plant: `substeps` that they ask for,
-        whether that is still `coarse`; and whether it was `told` of a program with a number of its own."""
+    def settled(self) -> dict[str, Any]:
+        """What its first solutions have shown once they were held against the plant, by the integrator that was asked
+        for; and whether it was `told` of a program with steps of its own."""
         return {}
 
     @cached_property
@@ -363,6 +392,8 @@ class Transcription:
         for name in self.solver.get_function():
             _at_zero(self.solver.get_function(name))
         self._split(ca.DM.zeros(self.solver.sparsity_in(0)))
+        if self.inner:
+            _at_zero(self._path)
 
     @cached_property
     def _evaluation(self) -> float:
@@ -386,7 +417,16 @@ class Transcription:
         """The variables of a guess; slacks are what it takes to hold the soft constraints."""
         T = np.full((len(t), self.free), t[-1])
         S = self.needed(t, x, u, p)
-        return np.r_[np.c_[x[:-1], T[:-1], u, S[:-1]].ravel(), x[-1], T[-1], S[-1]]
+        return np.r_[np.c_[x[:-1], T[:-1], u, S[:-1], self._stages(t, x, u, p)].ravel(), x[-1], T[-1], S[-1]]
+
+    def _stages(self, t: Array, x: Array, u: Array, p: Array) -> Array:
+        """The stages z [N, inner] of a guess; on a straight line to the next node where there are none."""
+        if not self.inner:
+            return np.zeros((self.N, 0))
+        z = self._path(x[:-1].T, u.T, *self.moment(t[:-1], p), np.diff(t)[None]).full().T
+        reach = np.tile(radau.REACH, self.substeps) / self.substeps
+        straight = (reach[None, :, None] * np.diff(x, axis=0)[:, None]).reshape(self.N, -1)
+        return np.where(np.isfinite(z).all(axis=1, keepdims=True), z, straight)
 
     def needed(self, t: Array, x: Array, u: Array, p: Array) -> Array:
         """The slacks [N+1, slacks] that hold the soft constraints at states x [N+1, nx], controls u [N, nu]."""
@@ -453,7 +493,7 @@ class Transcription:
     def _plan(self, result: dict[str, ca.DM], ends: Array, own: Array) -> tuple[Array, Array, Array, float]:
         """(x [N+1, nx], u [N, nu], t [N+1], cost) of what the solver found."""
         s, cost = self.ocp.system, float(result["f"]) * self.scales.cost
-        X, U, S = (v.full().T for v in self._split(result["x"] * self.scales.w))
+        X, U, S, _ = (v.full().T for v in self._split(result["x"] * self.scales.w))
         U = np.clip(U, s.lbu, s.ubu)  # IPOPT relaxes bounds by 1e-8
         X, t = X[:, :s.nx], ends * X[0, s.nx] if self.free else ends
         if self.held.slacks:  # whose bounds it relaxes, too
@@ -489,7 +529,7 @@ class Transcription:
         """What its hard inequalities along the trajectory dip by between nodes."""
         of = self.functions
         soft = np.array([name in self.eased for name in of.rows.names], dtype=bool)
-        return Dips(of, of.rows.column / ca.DM(of.scales), of.rows.equal | soft, self.substeps)
+        return Dips(of, of.rows.column / ca.DM(of.scales), of.rows.equal | soft, self.substeps, self.integrator)
 
     @cached_property
     def elastic(self) -> Transcription:

@@ -14,7 +14,8 @@
                                               (only its lower triangle is read); these two may stand in chain.h
    terminal(x, G, Gx, Gxx)
 
-   and SUBSTEPS, the Runge-Kutta steps in each interval, whose control is held over all of them.
+   and SUBSTEPS, the steps in each interval, whose control is held over all of them. Implicit steps have what radau.h lists in
+   place of stage_adjoints() and step_derivatives().
 
    A problem that holds the time or parameters has ND, TIMED (whether it holds the time) and NP too: its data d[ND] are t, where
    TIMED, then the NP parameters, and every function above that takes x takes d as well, behind x and u; with NP > 0 also
@@ -74,6 +75,9 @@ static void later(const lane *d, lane time, lane *now)
 #define ALONG(from, lam) const lane *lam = from;
 #endif
 
+#ifdef STAGES
+#include "radau.h"
+#else
 /* One Runge-Kutta step, x to next; returns its cost. */
 static lane step(const double *weights, const lane *x, const lane *u, DATA_IN lane h, lane *next)
 {
@@ -89,6 +93,39 @@ static lane step(const double *weights, const lane *x, const lane *u, DATA_IN la
     }
     return cost;
 }
+
+/* The derivatives of one Runge-Kutta step from x, second ones along lam (see step_derivatives); returns its cost. */
+static lane derivatives(const double *weights, const lane *x, const lane *u, DATA_IN const lane *lam, lane h,
+                        lane *F, lane *l, lane *H BY_P_IN)
+{
+    lane s[4][N], k[N + 1], net[4][NET + 1], tape[4][TAPE + 1], v[NV + 1], bend[BEND + 1];
+    lane J[4 * NJ + 1], W[4 * NW + 1], mu[4 * (N + 1)], cost = {0};
+    for (int j = 0; j < 4; ++j) {
+        for (int i = 0; i < N; ++i) s[j][i] = j ? x[i] + reach[j] * h * k[i] : x[i];
+        LATER(d, reach[j] * h, now)
+        network_slopes(weights, s[j], u, NOW net[j], tape[j]);
+        field(s[j], u, NOW net[j], k);
+        cost += share[j] * h * k[N];
+        stage_jacobian(s[j], u, NOW net[j], J + j * NJ);
+    }
+    stage_adjoints(J + NJ, J + 2 * NJ, J + 3 * NJ, lam, &h, mu);
+    for (int j = 0; j < 4; ++j) {
+        LATER(d, reach[j] * h, now)
+        network_weights(s[j], u, NOW net[j], mu + j * (N + 1), v);
+        network_bend(weights, v, tape[j], bend);
+        stage_hessian(s[j], u, NOW net[j], bend, mu + j * (N + 1), W + j * NW);
+#if defined(ND) && NP > 0
+        if (by_p) {
+            lane part[NP];
+            stage_parameters(s[j], u, now, net[j], bend, mu + j * (N + 1), part);
+            for (int i = 0; i < NP; ++i) by_p[i] += part[i];
+        }
+#endif
+    }
+    step_derivatives(J, W, &h, F, l, H);
+    return cost;
+}
+#endif
 
 /* u = clip(u_bar + alpha k + gain (x - x_bar)) from x0; writes x, u, J. */
 void nocl_rollout(int64_t first, int64_t last, const int64_t *index, int64_t K, const double *weights,
@@ -259,38 +296,6 @@ static void feedback(lane L[M][M], lane Q[NZ][NZ], const mask *held, lane gain[M
         substitute(L, column);
         for (int j = 0; j < M; ++j) gain[j][i] = column[j];
     }
-}
-
-/* The derivatives of one Runge-Kutta step from x, second ones along lam (see step_derivatives); returns its cost. */
-static lane derivatives(const double *weights, const lane *x, const lane *u, DATA_IN const lane *lam, lane h,
-                        lane *F, lane *l, lane *H BY_P_IN)
-{
-    lane s[4][N], k[N + 1], net[4][NET + 1], tape[4][TAPE + 1], v[NV + 1], bend[BEND + 1];
-    lane J[4 * NJ + 1], W[4 * NW + 1], mu[4 * (N + 1)], cost = {0};
-    for (int j = 0; j < 4; ++j) {
-        for (int i = 0; i < N; ++i) s[j][i] = j ? x[i] + reach[j] * h * k[i] : x[i];
-        LATER(d, reach[j] * h, now)
-        network_slopes(weights, s[j], u, NOW net[j], tape[j]);
-        field(s[j], u, NOW net[j], k);
-        cost += share[j] * h * k[N];
-        stage_jacobian(s[j], u, NOW net[j], J + j * NJ);
-    }
-    stage_adjoints(J + NJ, J + 2 * NJ, J + 3 * NJ, lam, &h, mu);
-    for (int j = 0; j < 4; ++j) {
-        LATER(d, reach[j] * h, now)
-        network_weights(s[j], u, NOW net[j], mu + j * (N + 1), v);
-        network_bend(weights, v, tape[j], bend);
-        stage_hessian(s[j], u, NOW net[j], bend, mu + j * (N + 1), W + j * NW);
-#if defined(ND) && NP > 0
-        if (by_p) {
-            lane part[NP];
-            stage_parameters(s[j], u, now, net[j], bend, mu + j * (N + 1), part);
-            for (int i = 0; i < NP; ++i) by_p[i] += part[i];
-        }
-#endif
-    }
-    step_derivatives(J, W, &h, F, l, H);
-    return cost;
 }
 
 /* Q = H + F' Vxx F, q = l + F' Vx. */
