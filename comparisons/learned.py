@@ -32,18 +32,26 @@ STATES, STARTS, INTERVALS = 8, 4, 80
 SHARE = 0.1  # of the wanted gap, that a model may lose
 REFINED = 2  # times, before networks are made wider
 WIDER, MORE = 1.5, 2  # times as wide, on so many times the labels
+LEAST = 1 / 60  # minutes of a fit
 SMALL = 1e-3  # of a usual cost: what there is to gain counts as no less
 
 
 @dataclass(frozen=True, eq=False)
 class ModelLoss:
-    """What a model's optimum loses as feedback on the exact f, of what there is to gain: 0 is nothing, 1 everything."""
+    """What a model's optimum loses as feedback on the exact f; inf where it does not get through, or was not found."""
 
-    lost: Array  # [n], (J - J*) / (J_base - J*); inf where the model's optimum does not get through, or was not found
+    lost: Array  # [n], (J - J*) / (J_base - J*): 0 is nothing, 1 all that there is to gain
+    gaps: Array  # [n], (J - J*) / |J*|, as training measures itself
 
     @property
     def median(self) -> float:
+        """Of what there is to gain."""
         return float(np.median(self.lost))
+
+    @property
+    def gap(self) -> float:
+        """The median gap."""
+        return float(np.median(self.gaps))
 
     @property
     def failed(self) -> int:
@@ -54,7 +62,7 @@ class ModelLoss:
         n, failed = len(self.lost), f", {self.failed} of them not at all" if self.failed else ""
         worst = np.max(self.lost[np.isfinite(self.lost)], initial=0.0)
         return (f"f_theta loses {_percent(self.median)} of what control is about (median; at most {_percent(worst)}) "
-                f"from {n} initial states{failed}")
+                f"from {n} initial states{failed}; gap {_percent(self.gap)}")
 
 
 def _percent(share: float) -> str:
@@ -95,7 +103,9 @@ class Yardstick:
     def loss(self, model: LearnedDynamics) -> tuple[ModelLoss, Solution]:
         """What a model loses, and its optima."""
         own = _optimum(self.ocp, model, self.starts, self.intervals, self.seed)
-        return ModelLoss((_run(self.ocp, own, self.starts) - self.best) / self.gain), own
+        more = _run(self.ocp, own, self.starts) - self.best
+        size = np.maximum(np.abs(self.best), SMALL * usual_sizes(self.ocp).cost)
+        return ModelLoss(more / self.gain, more / size), own
 
 
 def model_loss(ocp: OCP, model: LearnedDynamics, *, n: int = STATES, intervals: int = INTERVALS,
@@ -110,13 +120,15 @@ def model_loss(ocp: OCP, model: LearnedDynamics, *, n: int = STATES, intervals: 
 
 def good_enough(ocp: OCP, model: LearnedDynamics, wanted: float, settings: Settings, *, seed: int = 0,
                 intervals: int = INTERVALS, budget: Budget = ENDLESS) -> tuple[LearnedDynamics, ModelLoss]:
-    """The model, or one taught again along its own optima while it loses more than SHARE of the wanted gap, and what it
-    loses: refined twice, then with wider networks on more labels, as far as the budget goes. The best is kept.
+    """The model, or one taught again along its own optima while its gap is more than SHARE of the wanted one, and what
+    it loses: refined twice, then with wider networks on more labels, as far as the budget goes. The best is kept.
     """
     yard = Yardstick.of(ocp, intervals=intervals, seed=seed)
     loss, own = yard.loss(model)
     best, found, trials = model, loss, 0
-    while found.median > SHARE * wanted and trials <= REFINED and budget.share < 1 and _has_networks(model):
+    while found.gap > SHARE * wanted and trials <= REFINED and budget.share < 1 and _has_networks(model):
+        if budget.limited:
+            settings = replace(settings, minutes=max(budget.left / 60, LEAST))
         if trials == REFINED:
             settings = _wider(model, settings)
             model = identify(ocp.system, seed=seed, settings=settings, parameters=ocp.plant_parameters)
@@ -124,7 +136,7 @@ def good_enough(ocp: OCP, model: LearnedDynamics, wanted: float, settings: Setti
         loss, own = yard.loss(model)
         trials += 1
         say(f"{ocp.system.name}: taught again along its own optima, {loss}")
-        if loss.median < found.median:
+        if loss.gap < found.gap:
             best, found = model, loss
     return best, found
 

@@ -154,10 +154,11 @@ class RunFolder:
         except ValueError as error:  # what cannot be solved here, training tells with what to do
             say(f"dynamics: not held against the exact f: {error}")
             return model
-        better = replace(better, card={**better.card, KEY: model.card[KEY], "control_loss": loss.median})
+        own = {KEY: model.card[KEY], "control_loss": loss.median, "control_gap": loss.gap}
+        better = replace(better, card={**better.card, **own})
         better.save(self.folder / "dynamics")
         say(f"dynamics: {loss}")
-        if not loss.median <= wanted:
+        if not loss.gap <= wanted:
             say(f"dynamics: that is more than the gap of {100 * wanted:g} % that training wants: the controller will "
                 "be that of f_theta, not of the exact f; --exact trains on the exact f, --effort best learns it longer")
         return better
