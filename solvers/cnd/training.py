@@ -135,6 +135,19 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
     return Training(ocp, dynamics, chosen, seed, out, progress, own, begin).run()
 
 
+def estimate(ocp: OCP, settings: TrainSettings, seed: int = 0) -> str:
+    """How long a training on the exact f takes on this machine, in words, from a few solves and iterations.
+
+    Raises ValueError for problems that training refuses.
+    """
+    ocp.refuse_free("train")
+    ocp.check_strict("train")
+    with one_thread():
+        run = Training(ocp, None, settings, seed, None, False)
+        costs = measured(ocp, run.ddp, run.fine, run.in_torch, settings)
+    return str(Plan(settings, costs, parameters=ocp.np > 0, margins=run.held is not None))
+
+
 def _check(ocp: OCP, dynamics: LearnedDynamics | None, seed: int, out: str | os.PathLike[str] | None) -> None:
     checks.instance(OCP, ocp, "ocp", "train", "nocl.load_ocp(name)")
     checks.whole(seed, "seed", "train", most=2**62 - 1)
