@@ -48,7 +48,7 @@ def compare(ocp: OCP, methods: Mapping[str, Any], n: int = 100, x0: ArrayLike | 
         pay; or a Dask scheduler's "tcp://...". Solvers that take `workers` get it too
     out : a folder that gets each part's outcome as soon as it is there: the same call resumes what is there. A plain
         callable is known by its name: another one of that name needs another folder
-    progress : bars with the time left on stderr; default: where that is a terminal
+    progress : what is done and left on stderr: bars on a terminal, else a line every 10 s; default: True
     tolerance : a run that violates a constraint by more than this share of its scale has failed
 
     Nothing is dropped: where a method raises, does not converge or blows up, its row says so. Milliseconds: a solver's

@@ -1,7 +1,8 @@
 """`nocl doctor`: what can be known of a problem before work goes into it, each thing by a test that says what to do.
 
 The goal, controllability there, convexity in the controls, the step of integration, smoothness and symmetries are
-looked at; then a few initial states are solved by DDP from several starts, and two of them again by NMPC.
+looked at, and what controls that are held do; then a few initial states are solved by DDP from several starts, and two
+of them again by NMPC; the time that training takes is measured on a few solves and iterations.
 """
 
 from __future__ import annotations
@@ -18,6 +19,8 @@ from nocl.data import Solution
 from nocl.judge.simulation import simulate
 from nocl.ocp import OCP
 from nocl.scales import usual_sizes
+from nocl.solvers.cnd.settings import TrainSettings
+from nocl.solvers.cnd.training import estimate
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP
 from nocl.solvers.grid import fastest_at_start
@@ -31,6 +34,7 @@ STILL = 1e-6  # of usual sizes, what a state may drift by over the horizon at a 
 RANK = 1e-8  # relative singular values below which a mode is not controlled
 UNSTABLE = 1e-6  # modes times the horizon that grow faster need a control
 STATES, STARTS = 8, 4  # that are solved
+HELD = 4  # that held controls are tried from
 CHECKED = 2  # of them by NMPC, too
 AGREE = 1e-3  # of the cost: methods that differ by more disagree
 SMALL = 1e-3  # of a usual cost: costs are not divided by less
@@ -79,7 +83,7 @@ def doctor(ocp: OCP, intervals: int = 80, seed: int = 0) -> Diagnosis:
         found = [Finding("dynamics", REMARK, "not known (xdot=None): nothing else can be tested before a log has "
                          "taught them, nocl identify --data")]
     else:
-        found = [*_definition(ocp), *_solutions(ocp, intervals, seed)]
+        found = [*_definition(ocp), *_held(ocp, seed), *_solutions(ocp, intervals, seed), *_time(ocp, intervals, seed)]
     return Diagnosis(tuple(found), time.perf_counter() - begin)
 
 
@@ -146,6 +150,28 @@ def _convexity(ocp: OCP) -> Finding:
                    "there, and lower it; training's card says what it costs")
 
 
+def _held(ocp: OCP, seed: int) -> Iterator[Finding]:
+    """Whether states stay finite over the horizon under u held at u*, the middle and the bounds of U."""
+    if ocp.is_free:
+        return
+    s, n = ocp.system, HELD
+    x0, p = ocp.initial_states.sample(n, seed), ocp.sample_parameters(n, seed)
+    laws = {"u*": ocp.goals(p)[1], "the middle of U": np.tile((s.lbu + s.ubu) / 2, (n, 1)),
+            "lbu": np.tile(s.lbu, (n, 1)), "ubu": np.tile(s.ubu, (n, 1))}
+    lost = {}
+    for name, u in laws.items():
+        run = simulate(ocp, np.clip(u, s.lbu, s.ubu)[:, None], x0, p=p if ocp.np else None)
+        if not run.reached.all():
+            lost[name] = int((~run.reached).sum())
+    if not lost:
+        yield Finding("boundedness", OK, "states stay finite over the horizon under controls that are held")
+        return
+    where = ", ".join(f"{name} ({count} of {n} states)" for name, count in lost.items())
+    yield Finding("boundedness", REMARK, f"states blow up before the horizon under u held at {where}: first guesses "
+                  "and untrained controllers do so too; a shorter horizon, narrower bounds of U, or saturation in f "
+                  "where the plant has it")
+
+
 # Solutions
 
 
@@ -166,6 +192,21 @@ def _solutions(ocp: OCP, intervals: int, seed: int) -> Iterator[Finding]:
         yield _inside(ocp, found[found.success])
         yield _rivals(found[found.success])
         yield _second(ocp, found[found.success])
+
+
+def _time(ocp: OCP, intervals: int, seed: int) -> Iterator[Finding]:
+    """How long `nocl train --exact` takes here."""
+    if ocp.is_free:
+        return
+    settings = TrainSettings.of("normal", parameters=ocp.np, intervals=intervals)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            text = estimate(ocp, settings, seed)
+        except ValueError as error:
+            yield Finding("time needed", REMARK, f"not known, training does not take the problem: {error}")
+            return
+    yield Finding("time needed", OK, f"training on the exact f takes {text}")
 
 
 def _solved(ddp: DDP, seed: int) -> Solution:

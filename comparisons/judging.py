@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -25,6 +24,7 @@ from nocl.solvers.nmpc.loop import Loop
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
 from nocl.support.pool import Journal, Pool, do
+from nocl.support.progress import shown
 from nocl.translate.arguments import Arguments
 
 CALLS = 20  # control evaluations that are timed at each initial state, at most; the median counts
@@ -181,7 +181,7 @@ def judge(job: Judging, workers: int | str, out: Path | None, progress: bool | N
     rows = np.array_split(np.arange(B), min(B, PARTS))
     parts = [Share(f"run-{m}-{i:02d}", m, part) for i, part in enumerate(rows) for m in range(len(job.runs))]
     journal = Journal(out, key_of(job) if out is not None else "", "a comparison")
-    show = sys.stderr.isatty() if progress is None else progress
+    show = shown(progress)
     done = do(job, parts, Pool(_possible(job, workers)), journal, show, what)
     return [joined(job.ocp, [outcome.judgement for part, outcome in zip(parts, done, strict=True) if part.run == m])
             for m in range(len(job.runs))]

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from nocl.comparisons.promise import interval
 from nocl.comparisons.reference import Reference
@@ -19,6 +18,7 @@ from nocl.scales import usual_sizes
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
+from nocl.support.progress import bar as progress_bar
 
 SCALES = (0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0)
 HELD = 80  # intervals of the optimum that successes are measured by
@@ -40,14 +40,13 @@ def region(ocp: OCP, name: str, method: Any, scales: Sequence[float] = SCALES, n
     if not scales or min(scales) <= 0 or list(scales) != sorted(set(scales)):
         raise ValueError(f"scales is {scales!r}; expected rising numbers > 0, like (0.5, 1, 2)")
     states, good, p = list[Array](), list[Array](), ocp.sample_parameters(n, own_numbers(seed, 0, 1))
-    bar = tqdm(scales, desc=f"region of {name}", unit="scale", leave=False,
-               disable=None if progress is None else not progress)
-    for scale in bar:
-        states.append(grown(ocp.initial_states, scale).sample(n, seed))
-        good.append(succeeds(ocp, method, states[-1], within, p, tolerance))
-        if good[-1].mean() < 0.5:
-            bar.close()
-            break
+    with progress_bar(len(scales), f"region of {name}", progress, unit="scale", leave=False) as bar:
+        for scale in scales:
+            states.append(grown(ocp.initial_states, scale).sample(n, seed))
+            good.append(succeeds(ocp, method, states[-1], within, p, tolerance))
+            bar.update()
+            if good[-1].mean() < 0.5:
+                break
     k = np.array([g.sum() for g in good], dtype=np.int64)
     bounds = np.array([interval(int(one), n, confidence) for one in k])
     return Region(name, within, confidence, np.array(scales[: len(k)], dtype=np.float64), k, n, bounds[:, 0],

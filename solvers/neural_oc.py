@@ -30,13 +30,13 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
-from tqdm import tqdm
 
 from nocl.hamiltonian import minimiser
 from nocl.ocp import OCP
 from nocl.support import checks, store
 from nocl.support.checks import Array
 from nocl.support.fields import Checked, coefficients, count, flag, positive
+from nocl.support.progress import bar as progress_bar
 from nocl.support.threads import one_thread
 from nocl.translate.arguments import Arguments
 from nocl.translate.fused import FusedFunction
@@ -235,7 +235,7 @@ def train_neural_oc(ocp: OCP, settings: NeuralOCSettings | None = None, *, dynam
     ----------
     dynamics : None, the exact f: the method is published for known dynamics
     seed : of the initial network and the initial states; the caller's own generators are left alone
-    progress : a bar with the terms of the loss and the time left; None: where the terminal is one
+    progress : the terms of the loss and the time left, on stderr
 
     Path constraints enter as the OCP's penalty (OCP.L_soft). Nothing is written to disk. Raises ValueError for other
     dynamics; where H has no minimiser in closed form, or L is not strictly convex in u (u jumps then, and nothing is
@@ -316,10 +316,13 @@ class Trainer:
 
     def train(self, progress: bool | None) -> None:
         """All iterations that are left."""
-        todo, hidden = range(len(self.rows), self.settings.iterations), None if progress is None else not progress
-        for _ in (bar := tqdm(todo, f"NeuralOC on {self.ocp.system.name}", disable=hidden)):
-            self.iteration()
-            bar.set_postfix({n: f"{v:.3g}" for n, v in zip(TERMS, self.rows[-1], strict=True)}, refresh=False)
+        todo = range(len(self.rows), self.settings.iterations)
+        with progress_bar(len(todo), f"NeuralOC on {self.ocp.system.name}", progress) as bar:
+            for _ in todo:
+                self.iteration()
+                said = ", ".join(f"{n}={v:.3g}" for n, v in zip(TERMS, self.rows[-1], strict=True))
+                bar.set_postfix_str(said, refresh=False)
+                bar.update()
 
     def iteration(self) -> None:
         """One step of Adam, and what is due after it."""

@@ -326,7 +326,7 @@ def test_a_run_from_a_users_file_to_its_report(here, capsys, monkeypatch):
     x = np.array([1.0, 0.1])
     np.testing.assert_allclose(policy(x, 0.5).full().ravel(), cnd(x, 0.5), rtol=1e-12)
     rows = json.loads((run / "report" / "summary.json").read_text())["summary"]
-    assert [row["method"] for row in rows] == ["CND", "NMPC", "reference"]
+    assert [row["method"] for row in rows] == ["CND on f_theta", "NMPC", "reference"]
 
     before = {p: p.stat().st_mtime_ns for part in ("dynamics", "cnd") for p in (run / part).iterdir()}
     assert main([*RUN[:-3], "3", "--intervals", "10", "--methods", "cnd,lqr"]) == 0  # the same, on other states
@@ -362,7 +362,7 @@ def test_a_run_from_a_users_file_to_its_report(here, capsys, monkeypatch):
     assert (tree(run), run.stat().st_mtime_ns) == (before, changed)  # not even for a while
     assert not (here / "elsewhere" / "checkpoint").exists()
     out = capsys.readouterr().out
-    assert "CND (20 holds)" in out
+    assert "CND on f_theta (20 holds)" in out
     assert "on 2 initial states, drawn with seed 2" in out  # one more than that of the run
     assert main(["compare", "out", "--n", "2", "--methods", "CND", "--seed", "7"]) == 0
     assert "drawn with seed 8" in capsys.readouterr().out

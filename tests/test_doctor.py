@@ -6,7 +6,7 @@ import pytest
 
 import nocl
 from nocl.cli import main
-from nocl.comparisons.diagnosis import OK, PROBLEM, REMARK, doctor
+from nocl.comparisons.diagnosis import OK, PROBLEM, REMARK, _held, doctor
 from nocl.solvers import NMPC
 
 X, V, U = ca.SX.sym("pos"), ca.SX.sym("v"), ca.SX.sym("force")
@@ -29,10 +29,19 @@ def test_a_good_problem_is_well():
     found, by = said(cart())
     assert found.ok
     assert {finding.verdict for finding in found.findings} == {OK}
-    assert list(by) == ["goal", "controllability", "convexity", "symmetries", "integration", "solutions", "box X",
-                        "rival optima", "second opinion"]
+    assert list(by) == ["goal", "controllability", "convexity", "symmetries", "boundedness", "integration", "solutions",
+                        "box X", "rival optima", "second opinion", "time needed"]
+    assert "on this machine" in by["time needed"].text
     assert by["solutions"].text.startswith("8 of 8 initial states")
     assert "nothing better on 2 state(s)" in str(found)
+
+
+def test_states_that_blow_up_under_held_controls():
+    """v' = v^2 + u from v = 1 at most is infinite before 1 s."""
+    (found,) = _held(cart((V, V**2 + U), horizon=3.0), 0)
+    assert (found.about, found.verdict) == ("boundedness", REMARK)
+    assert "ubu (4 of 4 states)" in found.text
+    assert "lbu" not in found.text
 
 
 def test_a_goal_that_drifts():

@@ -86,7 +86,7 @@ def _share(percent_of_n: float, n: int) -> str:
 def _speed(summary: Sequence[Row]) -> list[str]:
     """The fastest and the slowest of the useful methods; CND and NMPC, where both are there."""
     useful = [row for row in summary if row["within_5"] > 0 and row["ms_per_solve"] > 0 and row["method"] != REFERENCE]
-    pair = [row for row in useful if row["method"] in ("CND", "NMPC")]
+    pair = [row for row in useful if row["method"] in ("CND", "CND on f_theta", "NMPC")]
     timed = sorted(pair if len(pair) == 2 else useful, key=lambda row: row["ms_per_solve"])
     if len(timed) < 2:
         return []

@@ -18,10 +18,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
-from tqdm import tqdm
 
 from nocl.solvers import registry
 from nocl.support import store
+from nocl.support.progress import bar as progress_bar
+from nocl.support.progress import say
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -149,13 +150,15 @@ class PaperTable(ABC, Generic[P, C, E]):
         """The cells of a plan, those that are finished in folder `out` taken from there; a way whose extra is not
         installed is left out, and said so on the bar."""
         folder, cells = Path(out), []
-        with tqdm(self.places(plan), self.title, disable=not progress, unit="cell", smoothing=0.05) as bar:
-            for place in bar:
+        places = self.places(plan)
+        with progress_bar(len(places), self.title, progress, unit="cell") as bar:
+            for place in places:
                 if missing := self.missing(place.way):
-                    bar.write(f"{self.ways[place.way].title} is left out: {missing}")
+                    say(f"{self.ways[place.way].title} is left out: {missing}", progress)
                     continue
                 bar.set_postfix_str(f"{place.problem}, {self.ways[place.way].title}, seed {place.seed}")
                 cells.append(self._kept(folder, plan, place) or self._made(folder, plan, place))
+                bar.update()
         return cells
 
     def missing(self, way: str) -> str:

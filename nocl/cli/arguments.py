@@ -26,6 +26,14 @@ def count(text: str) -> int:
     return whole(text, 1, MOST)
 
 
+def minutes(text: str) -> float:
+    """A time > 0."""
+    number = _number(text)
+    if number is None or number <= 0:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of minutes > 0")
+    return number
+
+
 def workers(text: str) -> int | str:
     return text if text == "auto" or "://" in text else count(text)
 

@@ -99,9 +99,9 @@ def parser() -> argparse.ArgumentParser:
     sub = command("doctor", _doctor, "examine a problem in half a minute: goal, controllability, stiffness, optima")
     _add(sub, "problem", "p", "seed", "intervals")
     sub = command("run", _run, "identify, train, export, solve by NMPC, compare and report, in one go")
-    _add(sub, "problem", "p", "out", "seed", "n", "exact", "effort", "quick", "intervals", "methods")
+    _add(sub, "problem", "p", "out", "seed", "n", "exact", "effort", "quick", "minutes", "intervals", "methods")
     sub = command("identify", _identify, "learn the dynamics, from the equations or from logged trajectories")
-    _add(sub, "problem", "p", "out", "seed", "effort", "quick")
+    _add(sub, "problem", "p", "out", "seed", "effort", "quick", "minutes")
     sub.add_argument("--data", type=Path, metavar="LOG", help="a .csv or .parquet file with columns t, states, "
                      "controls, and run: learn from it alone, test on a fifth of its runs")
     sub.add_argument("--known", type=arguments.known, metavar="A=B,C=D", help="with --data: derivatives that are "
@@ -109,7 +109,7 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--control-affine", action="store_true", help="with --data: xdot = a(x) + B(x) u")
     sub.add_argument("--hold-controls", action="store_true", help="with --data: an empty control is the last before it")
     sub = command("train", _train, "train a controller and a value function, on learned dynamics unless --exact")
-    _add(sub, "problem", "p", "out", "seed", "exact", "effort", "quick")
+    _add(sub, "problem", "p", "out", "seed", "exact", "effort", "quick", "minutes", "intervals")
     sub = command("solve", _solve, "solve the problem from many initial states")
     _add(sub, "problem", "p", "out", "seed", "n", "intervals")
     sub.add_argument("--solver", choices=registry.solvers(), default="nmpc", metavar="NAME",
@@ -158,8 +158,11 @@ def _add(sub: argparse.ArgumentParser, *names: str) -> None:
                                 "normal"}),
         "quick": ("--quick", {"dest": "effort", "action": "store_const", "const": "quick",
                               "default": argparse.SUPPRESS, "help": "the same as --effort quick"}),
+        "minutes": ("--minutes", {"type": arguments.minutes, "metavar": "M",
+                                  "help": "of wall-clock time for identification and training together: they are made "
+                                          "to fit it, and the best controller so far is taken; default: no limit"}),
         "intervals": ("--intervals", {"type": arguments.count, "default": 80, "metavar": "N",
-                                      "help": "of plans; default: 80"}),
+                                      "help": "of plans, of training's too; default: 80"}),
         "methods": ("--methods", {"type": arguments.methods, "default": ("cnd", "nmpc"), "metavar": "A,B",
                                   "help": f"default: cnd,nmpc; {_told_of(registry.METHODS)}"})}
     for name in names:
@@ -224,7 +227,7 @@ def _run(args: argparse.Namespace) -> None:
     ocp.refuse_free("nocl run")
     if not args.exact:
         _check_learnable(ocp)
-    stages = RunFolder(ocp, out, args.seed, args.effort)
+    stages = RunFolder(ocp, out, args.seed, args.effort, args.minutes, args.intervals)
     stages.check(exact=args.exact)
     _refuse(ocp, args.methods, registry.Options(args.intervals, args.seed))
     with alone(out):
@@ -250,8 +253,10 @@ def _identify(args: argparse.Namespace) -> None:
 
     ocp, out = _problem(args)
     _check_learnable(ocp)
-    stages = RunFolder(ocp, out, args.seed, args.effort)
+    stages = RunFolder(ocp, out, args.seed, args.effort, args.minutes)
     stages.check(exact=False)
+    if args.data is not None and args.minutes is not None:
+        raise ValueError("--minutes is not for logs: LogSettings has steps, windows and iterations; leave it out")
     if args.data is None and (args.known or args.control_affine or args.hold_controls):
         raise ValueError("--known, --control-affine and --hold-controls are for logs: name one by --data")
     with alone(out):
@@ -268,7 +273,7 @@ def _train(args: argparse.Namespace) -> None:
     if not args.exact:
         ocp.refuse_free("nocl train without --exact")
         _check_learnable(ocp)
-    stages = RunFolder(ocp, out, args.seed, args.effort)
+    stages = RunFolder(ocp, out, args.seed, args.effort, args.minutes, args.intervals)
     stages.check(exact=args.exact)
     with alone(out):
         stages.train(exact=args.exact)

@@ -11,7 +11,7 @@ import io
 import shutil
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib.metadata import version
 from inspect import signature
 from pathlib import Path
@@ -23,6 +23,7 @@ from nocl import __version__
 from nocl.comparisons.disturbances import mass_variants
 from nocl.comparisons.each import Laws, at_each, is_plan
 from nocl.comparisons.judging import Disturbance, Judging
+from nocl.comparisons.learned import good_enough
 from nocl.comparisons.methods import Solving, Starts, own_rate, runs_of
 from nocl.comparisons.report.results import count
 from nocl.comparisons.studies import study
@@ -36,6 +37,7 @@ from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.settings import TrainSettings
 from nocl.solvers.cnd.training import train
 from nocl.support import store
+from nocl.support.budget import ENDLESS, Budget
 from nocl.support.fingerprint import fingerprint, json_text, sha256
 from nocl.sysid.identification import LearnedDynamics, LogSettings, Settings, identify
 from nocl.sysid.logs.log import Log
@@ -43,6 +45,9 @@ from nocl.sysid.logs.log import Log
 PARTS = ("dynamics", "cnd", "export", "report", "checkpoint")  # folders in a run's folder
 KEY = "run"  # of a card: what the stage was made from
 COARSE = 0.01  # of a cost: where judge and plan differ by more, the plan's grid is too coarse
+INTERVALS = 80  # of training's plans, where nobody says
+IDENTIFYING = 0.3  # of a run's minutes, at most
+CHECKING = 0.2  # of those left then, for teaching it again
 JUDGED = 64  # plans of `nocl solve` that are run on the exact f
 OF_LOGS = ("data", "known", "control_affine", "hold_controls")  # of that, what dynamics of a log have more
 
@@ -55,6 +60,9 @@ class RunFolder:
     folder: Path
     seed: int
     effort: str = "normal"  # the word that scales all settings: "quick", "normal" or "best"
+    minutes: float | None = None  # of identification and training together, from when this is made on
+    intervals: int = INTERVALS  # of training's plans
+    begin: float = field(default_factory=time.monotonic)
 
     def check(self, exact: bool) -> None:
         """ValueError where the folder holds something that is not a run's, before any work."""
@@ -65,8 +73,8 @@ class RunFolder:
             self._dynamics_there()
         self._cnd_there()
 
-    def identify(self) -> LearnedDynamics:
-        """The learned dynamics, in dynamics/."""
+    def identify(self, share: float = 1.0) -> LearnedDynamics:
+        """The learned dynamics, in dynamics/; share: of the minutes that there are, if there is a limit."""
         made_from, there = self._made_from(), self._dynamics_there()
         if there is not None and (there.card[KEY] == made_from or _of_a_log(there, made_from)):
             say(f"dynamics: taken from {self.folder / 'dynamics'} ({there.card.get('score', '')})")
@@ -74,7 +82,8 @@ class RunFolder:
         say(f"dynamics: learning f of {self.ocp.system.name}" + _anew(there))
         start = time.perf_counter()
         checkpoint = self.folder / "checkpoint" / "dynamics"
-        model = identify(self.ocp.system, seed=self.seed, settings=Settings.of(self.effort),
+        time_for = {} if self.minutes is None else {"minutes": self._minutes_left(share)}
+        model = identify(self.ocp.system, seed=self.seed, settings=Settings.of(self.effort, **time_for),
                          checkpoint=checkpoint, parameters=self.ocp.plant_parameters)
         model = replace(model, card={**model.card, KEY: made_from})
         model.save(self.folder / "dynamics")
@@ -111,17 +120,19 @@ class RunFolder:
 
     def train(self, exact: bool) -> CND:
         """The controller and value function, in cnd/; on dynamics/ unless exact."""
-        model = None if exact else self.identify()
+        model = None if exact else self._good_enough(self.identify(IDENTIFYING))
         data = {} if model is None else {k: v for k, v in model.card[KEY].items() if k in OF_LOGS}
-        made_from, there = self._made_from(exact=exact, **data), self._cnd_there()
+        grid = {} if self.intervals == INTERVALS else {"intervals": self.intervals}
+        made_from, there = self._made_from(exact=exact, **grid, **data), self._cnd_there()
         if there is not None and there.card.get(KEY) == made_from:
             say(f"controller: taken from {self.folder / 'cnd'}")
             return there
         say(f"controller: training on {'the exact' if exact else 'learned'} dynamics" + _anew(there))
         start = time.perf_counter()
         checkpoint = self.folder / "checkpoint" / "cnd"
-        settings = TrainSettings.of(self.effort, parameters=self.ocp.np)
-        cnd = train(self.ocp, model, seed=self.seed, settings=settings, out=checkpoint)
+        settings = TrainSettings.of(self.effort, parameters=self.ocp.np, intervals=self.intervals)
+        left = None if self.minutes is None else self._minutes_left()
+        cnd = train(self.ocp, model, seed=self.seed, settings=settings, out=checkpoint, minutes=left)
         cnd.card[KEY] = made_from
         if opinion := cnd.card.get("second_opinion", {}).get("text"):
             say(f"controller: {opinion}")
@@ -130,6 +141,28 @@ class RunFolder:
         _forget(checkpoint)
         say(f"controller: done, {time.perf_counter() - start:.0f} s")
         return cnd
+
+    def _good_enough(self, model: LearnedDynamics) -> LearnedDynamics:
+        """The dynamics that training goes on with: what their optimum loses on the exact f is told, lowered where it
+        can be, and on the card. Of an f that is not known, errors on its log were told."""
+        if self.ocp.system.xdot is None or "control_loss" in model.card or "data" in model.card[KEY]:
+            return model
+        wanted = TrainSettings.of(self.effort).gap_median
+        budget = ENDLESS if self.minutes is None else Budget(60 * self._minutes_left(CHECKING))
+        try:
+            better, loss = good_enough(self.ocp, model, wanted, Settings.of(self.effort), seed=self.seed,
+                                       intervals=self.intervals, budget=budget)
+        except ValueError as error:  # what cannot be solved here, training tells with what to do
+            say(f"dynamics: not held against the exact f: {error}")
+            return model
+        own = {KEY: model.card[KEY], "control_loss": loss.median, "control_gap": loss.gap}
+        better = replace(better, card={**better.card, **own})
+        better.save(self.folder / "dynamics")
+        say(f"dynamics: {loss}")
+        if not loss.gap <= wanted:
+            say(f"dynamics: that is more than the gap of {100 * wanted:g} % that training wants: the controller will "
+                "be that of f_theta, not of the exact f; --exact trains on the exact f, --effort best learns it longer")
+        return better
 
     def export(self, cnd: CND, out: Path, forms: Sequence[str], against: Sequence[str] | None,
                strict: bool = False) -> None:
@@ -149,7 +182,8 @@ class RunFolder:
         titles = ", ".join(entry.title for entry in entries)
         say(f"comparing {titles} on {n} initial states, drawn with seed {fresh_seed(self.seed)}{own_p(self.ocp, at)}, "
             "on the exact dynamics")
-        chosen = {entry.title: built(self.ocp, entry, options) if entry.make else cnd for entry in entries}
+        chosen = {entry.title if entry.make else trained_on(entry.title, cnd):
+                  built(self.ocp, entry, options) if entry.make else cnd for entry in entries}
         model = self._dynamics_there() if cnd.card.get("dynamics") == "learned" else None
         checkpoint = self._checkpoint(
             beside(out, self.folder), methods=list(methods), n=n, intervals=intervals, hold=str(hold), robust=robust,
@@ -164,7 +198,13 @@ class RunFolder:
 
     def _made_from(self, **settings: Any) -> dict[str, Any]:
         problem = sha256(json_text(self.ocp.to_data()))  # as the cards of earlier runs have it
-        return {"problem": problem, "seed": self.seed, "effort": self.effort, **settings}
+        limit = {} if self.minutes is None else {"minutes": self.minutes}
+        return {"problem": problem, "seed": self.seed, "effort": self.effort, **limit, **settings}
+
+    def _minutes_left(self, share: float = 1.0) -> float:
+        """A share of the minutes that there are still, and a second at least."""
+        assert self.minutes is not None
+        return max(share * (self.minutes - (time.monotonic() - self.begin) / 60), 1 / 60)
 
     def _checkpoint(self, folder: Path, **settings: Any) -> Path:
         """Where outcomes so far are kept while a comparison lasts: another one goes elsewhere."""
@@ -202,6 +242,11 @@ def _of_a_log(model: LearnedDynamics, made_from: dict[str, Any]) -> bool:
 def _anew(there: Any) -> str:
     """Why something that stands there is made again."""
     return "" if there is None else " (what is there was made for another problem, seed or setting)"
+
+
+def trained_on(title: str, cnd: CND) -> str:
+    """A controller's name in reports, which says what it was trained on where that is not the exact f."""
+    return f"{title} on f_theta" if cnd.card.get("dynamics") == "learned" else title
 
 
 def beside(out: Path, run: Path) -> Path:

@@ -22,12 +22,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tqdm import tqdm
 
 from nocl.support.atomic import remove_parts, write_bytes
 from nocl.support.checks import LARGEST, MALFORMED, shown
 from nocl.support.fingerprint import sha256
 from nocl.support.lock import alone
+from nocl.support.progress import bar as progress_bar
 
 Task = Any
 Outcome = Any
@@ -289,8 +289,8 @@ def _streamed(job: Any, tasks: Sequence[Task], pool: Pool, journal: Journal, sho
     known = {task.name for task in tasks if journal.read(task) is not None}
     todo = [task for task in tasks if task.name not in known]
     total = sum(task.size for task in tasks)
-    with tqdm(total=total, initial=total - sum(task.size for task in todo), desc=what, unit="state", delay=3.0,
-              leave=False, disable=not show or len(todo) < 2) as bar:
+    with progress_bar(total, what, show and len(todo) > 1, unit="state", delay=3.0, leave=False,
+                      initial=total - sum(task.size for task in todo)) as bar:
         for task in tasks:
             if task.name in known:
                 yield journal.read(task)

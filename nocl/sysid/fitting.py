@@ -16,7 +16,10 @@ import torch
 from scipy.linalg.blas import ssyrk
 from torch import Tensor
 
+from nocl.support.budget import ENDLESS, Budget
+
 Weights = list[Tensor]  # W1, W2, W3
+LEAST = 50  # steps of SOAP, however small the budget
 OnStep = Callable[[float], None]  # called once a step with the root mean square of the scaled residuals
 
 
@@ -147,7 +150,8 @@ def loss(weights: Sequence[Tensor], batch: Batch, scale: Tensor) -> Tensor:
 Draw = Callable[[int], tuple[Batch, Tensor]]  # batch size -> a fresh batch and the scale of its residuals
 
 
-def soap(weights: Weights, draw: Draw, *, iterations: int, batch: int, lr: float, report: OnStep) -> Weights:
+def soap(weights: Weights, draw: Draw, *, iterations: int, batch: int, lr: float, report: OnStep,
+         budget: Budget = ENDLESS) -> Weights:
     """Adam in Shampoo's eigenbases (Vyas et al. 2024), cosine schedule with 50 steps of warm-up; new weights."""
     own = [w.detach().clone().requires_grad_() for w in weights]
 
@@ -155,19 +159,25 @@ def soap(weights: Weights, draw: Draw, *, iterations: int, batch: int, lr: float
         value = loss(own, *draw(batch))
         return float(value.detach()), torch.autograd.grad(value, own)
 
-    return soap_steps(own, value_and_gradients, iterations=iterations, lr=lr, report=report)
+    return soap_steps(own, value_and_gradients, iterations=iterations, lr=lr, report=report, budget=budget)
 
 
 def soap_steps(weights: Weights, value_and_gradients: Callable[[], tuple[float, Sequence[Tensor]]], *, iterations: int,
-               lr: float, report: OnStep) -> Weights:
-    """`soap` on the loss and its gradients at these weights, which are changed in place; the result is detached."""
+               lr: float, report: OnStep, budget: Budget = ENDLESS) -> Weights:
+    """`soap` on the loss and its gradients at these weights, which are changed in place; the result is detached.
+
+    Where the budget is spent sooner, it is the schedule: the rate falls with the share of it that is spent.
+    """
     from pytorch_optimizer import SOAP
 
     if not iterations:
         return [w.detach() for w in weights]
     optimizer = SOAP(weights, lr=lr, weight_decay=0.0)
     for i in range(iterations):
-        optimizer.param_groups[0]["lr"] = lr * min(1.0, (i + 1) / 50) * _cosine(i / iterations)
+        done = max(i / iterations, budget.share)
+        if done >= 1 and i >= LEAST:
+            break
+        optimizer.param_groups[0]["lr"] = lr * min(1.0, (i + 1) / 50) * _cosine(done)
         value, gradients = value_and_gradients()
         for w, g in zip(weights, gradients, strict=True):
             w.grad = g
@@ -180,14 +190,17 @@ def _cosine(progress: float) -> float:
     return 0.5 * (1 + math.cos(math.pi * progress)) + 1e-3
 
 
-def levenberg_marquardt(weights: Weights, draw: Draw, *, steps: int, batch: int, report: OnStep) -> Weights:
+def levenberg_marquardt(weights: Weights, draw: Draw, *, steps: int, batch: int, report: OnStep,
+                        budget: Budget = ENDLESS) -> Weights:
     """Damped Gauss-Newton steps, all on one batch, each kept only if it lowers the loss; float64 weights.
 
     The damping is in units of the diagonal of J'J: x 0.2 on success, x 4 on failure. Fresh batches would keep it up:
-    what one step gains, the next batch does not see.
+    what one step gains, the next batch does not see. No step begins once the budget is spent.
     """
     weights, damping, (now, scale) = [w.detach().double() for w in weights], 1e-4, draw(batch)
     for _ in range(steps):
+        if budget.share >= 1:
+            break
         JJ, Jr, before = gauss_newton(weights, now, scale)
         for _ in range(8):
             candidate = _step(weights, JJ, Jr, damping)

@@ -30,6 +30,7 @@ from nocl.nets import MLP, FeatureNet
 from nocl.parameters import rows as parameter_rows
 from nocl.sampling import Distribution, Gaussian, Seed, Uniform
 from nocl.support import checks
+from nocl.support.budget import ENDLESS, Budget
 from nocl.support.checks import Array
 from nocl.support.store import reading
 from nocl.support.threads import one_thread
@@ -264,7 +265,8 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
     """
     settings = _check_arguments(system, method, gradients, settings, seed, data)
     plant, system = system, _widened(system, parameters, control_affine)
-    stated, start, bar = Stated.of(system, known, control_affine), time.perf_counter(), Progress(system.name, progress)
+    stated, start = Stated.of(system, known, control_affine), time.perf_counter()
+    bar = Progress(system.name, progress, _time_of(settings))
     if isinstance(data, Log):
         assert isinstance(settings, LogSettings)
         return _from_log(system, data, stated, settings, seed, bar)._of(plant, parameters)
@@ -290,6 +292,11 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
             "labels": source.labels, "seconds": round(time.perf_counter() - start, 3), "torch": torch.__version__}
     card["score"] = _score_text(system, net)
     return LearnedDynamics(system, net, words, card, parts)._of(plant, parameters)
+
+
+def _time_of(settings: Settings | PaperSettings | LogSettings) -> Budget:
+    minutes = settings.minutes if isinstance(settings, Settings) else None
+    return ENDLESS if minutes is None else Budget(60 * minutes)
 
 
 def _widened(system: System, parameters: Distribution | None, control_affine: bool) -> System:
@@ -396,11 +403,11 @@ def _refined(model: LearnedDynamics, states: ArrayLike, controls: ArrayLike, spr
     tube = rng.random(n) < share
     picked = near[rng.integers(len(near), size=int(tube.sum()))]
     z[tube] = picked + spread * box.width * rng.standard_normal(picked.shape)
-    pool, bar = labelled(source, parts, z), Progress(system.name, progress)
+    pool, bar = labelled(source, parts, z), Progress(system.name, progress, _time_of(settings))
     old = [weights_of(net) for net in model.net.nets if isinstance(net, MLP)]
     angles = bool(model.card["settings"]["angles"])
     settings = replace(settings, angles=angles)
-    weights = [fit_group(parts, pool, i, settings, seed, bar, w) for i, w in enumerate(old)]
+    weights = [fit_group(parts, pool, i, settings, seed, bar.part(1 / (len(old) - i)), w) for i, w in enumerate(old)]
     net = assemble(parts, weights, angles)
     card = {**model.card, "labels": model.card["labels"] + source.labels, "refined": model.card.get("refined", 0) + 1,
             "seconds": round(model.card["seconds"] + time.perf_counter() - start, 3),

@@ -31,6 +31,7 @@ PLAIN = 4  # variables beyond which a network without sines and cosines of angle
 PER_WEIGHT = 4  # labels in a batch of Levenberg-Marquardt, at least: it would meet fewer of them and nothing between
 NARROWEST = 8  # wide, however few the labels
 SMOOTH = 0.5  # times the hidden layers' usual first weights, where labels are few
+DESCENT = 0.4  # of a network's time, for SOAP before Levenberg-Marquardt
 LONGER = 3  # times as many Levenberg-Marquardt steps there: each is cheap, and they go on to gain
 
 
@@ -44,13 +45,19 @@ def fit_groups(source: Source, parts: Structure, settings: Settings, seed: int, 
     if source.oracle is not None and source.gradients and not settings.angles:
         found = frequencies(source, parts, pool.z[:PROBES])
     weights = []
+    work = [_work(settings.budget(len(group.variables)), len(group.coefficients)) for group in parts.groups]
     for i in range(len(parts.groups)):
         done = checkpoint.get(i)
         if done is None:
-            done = fit_group(parts, pool, i, settings, seed, bar, None, found)
+            done = fit_group(parts, pool, i, settings, seed, bar.part(work[i] / sum(work[i:])), None, found)
             checkpoint.put(i, done)
         weights.append(done)
     return weights
+
+
+def _work(budget: Budget, outputs: int) -> float:
+    """Of one network's fit, beside others'."""
+    return budget.batch * (budget.iterations + budget.polish * budget.width) * budget.width * (budget.width + outputs)
 
 
 def fit_group(parts: Structure, pool: LabelPool, index: int, settings: Settings, seed: int,
@@ -73,7 +80,7 @@ def fit_group(parts: Structure, pool: LabelPool, index: int, settings: Settings,
     if plain:
         with bar.stage(f"{title}, SOAP", budget.iterations) as report:
             weights = train_plain(samples, budget, lr, settings.gradient_weight, draws.generator, report, first,
-                                        own)
+                                        own, bar.time)
     elif own is None:
         start = fitting.initial(samples.phi.shape[1], budget.width, samples, draws.generator, first)
         start = [SMOOTH * start[0], SMOOTH * start[1], start[2]] if few else start
@@ -90,12 +97,13 @@ def _trained(weights: fitting.Weights, draws: Draws, budget: Budget, lr: float, 
     if budget.iterations:
         with bar.stage(f"{title}, SOAP", budget.iterations) as report:
             weights = fitting.soap([w.float() for w in weights], draws.to(torch.float32), iterations=budget.iterations,
-                               batch=budget.batch, lr=lr, report=report)
+                               batch=budget.batch, lr=lr, report=report, budget=bar.time.part(DESCENT))
     if budget.polish and _can_be_polished(weights):
         enough = -(-PER_WEIGHT * sum(w.numel() for w in weights) * len(draws.samples) // draws.labels)
         with bar.stage(f"{title}, Levenberg-Marquardt", budget.polish) as report:
             weights = fitting.levenberg_marquardt(weights, draws, steps=budget.polish,
-                                              batch=max(budget.polish_batch, enough), report=report)
+                                              batch=max(budget.polish_batch, enough), report=report,
+                                              budget=bar.time)
     return [w.double() for w in weights]
 
 

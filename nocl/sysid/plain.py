@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from nocl.support.budget import ENDLESS
+from nocl.support.budget import Budget as Time
 from nocl.sysid import fitting
 from nocl.sysid.loss import Loss
 from nocl.sysid.settings import Budget
@@ -72,7 +74,7 @@ class Linear:
 
 def train(samples: fitting.Samples, budget: Budget, lr: float, weight: float, generator: torch.Generator,
           report: fitting.OnStep, frequency: Tensor | None = None,
-          old: fitting.Weights | None = None) -> fitting.Weights:
+          old: fitting.Weights | None = None, time: Time = ENDLESS) -> fitting.Weights:
     """Weights of a network whose features are the variables; float64.
 
     weight: of Jacobians beside values, both relative to their spread. frequency [F]: of the first weights.
@@ -82,7 +84,7 @@ def train(samples: fitting.Samples, budget: Budget, lr: float, weight: float, ge
     if len(linear.outputs):
         z, y, dy = linear.left(samples)
         loss = _loss([z.shape[1], len(own[0]), len(own[0]), y.shape[1]], z, y, dy, weight)
-        own = _soap(own, loss, len(z), budget, lr, generator, report)
+        own = _soap(own, loss, len(z), budget, lr, generator, report, time)
     return linear.join(own)
 
 
@@ -107,7 +109,7 @@ def _loss(sizes: list[int], z: Tensor, y: Tensor, dy: Tensor, weight: float) -> 
 
 
 def _soap(weights: fitting.Weights, loss: Loss, n: int, budget: Budget, lr: float, generator: torch.Generator,
-          report: fitting.OnStep) -> fitting.Weights:
+          report: fitting.OnStep, time: Time) -> fitting.Weights:
     """fitting.soap's optimiser and schedule, on random batches of n labels."""
     own = [w.float().clone().requires_grad_() for w in weights]
     theta = torch.empty(sum(w.numel() for w in own))
@@ -121,4 +123,5 @@ def _soap(weights: fitting.Weights, loss: Loss, n: int, budget: Budget, lr: floa
         value = loss(torch.randint(n, (budget.batch,), generator=generator), theta, gradient)
         return value, [torch.cat([W, b[:, None]], 1) for W, b in zip(slopes[::2], slopes[1::2], strict=True)]
 
-    return fitting.soap_steps(own, value_and_gradients, iterations=budget.iterations, lr=lr, report=report)
+    return fitting.soap_steps(own, value_and_gradients, iterations=budget.iterations, lr=lr, report=report,
+                              budget=time)

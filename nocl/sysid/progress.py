@@ -1,41 +1,54 @@
-"""What a long identification shows and keeps: progress bars, finished networks."""
+"""What a long identification shows and keeps: progress, finished networks."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from nocl.support import store
+from nocl.support.budget import ENDLESS, Budget
+from nocl.support.progress import Bar
+from nocl.support.progress import bar as progress_bar
 from nocl.sysid import fitting
 from nocl.sysid.settings import Settings
 from nocl.system import System
 
+TRIAL = 0.1  # of the time that is left, for one
 
+
+@dataclass(frozen=True)
 class Progress:
-    """One tqdm bar a stage, with the loss and the time left."""
+    """A bar for each stage, with its error; and the time that the stages have."""
 
-    def __init__(self, name: str, show: bool) -> None:
-        self.name, self.show = name, show
+    name: str
+    show: bool
+    time: Budget = ENDLESS
 
     def stage(self, title: str, total: int) -> _Bar:
-        return _Bar(f"identify {self.name}: {title}", total, self.show and total > 0)
+        return _Bar(progress_bar(total, f"identify {self.name}: {title}", self.show and total > 0))
+
+    def trial(self, title: str) -> Progress:
+        """Of fits beside the ones that stay."""
+        return Progress(f"{self.name}, {title}", self.show, self.time.part(TRIAL))
+
+    def part(self, share: float) -> Progress:
+        """The same, with a share of the time that is left."""
+        return replace(self, time=self.time.part(share))
 
 
+@dataclass(frozen=True)
 class _Bar:
-    def __init__(self, title: str, total: int, show: bool) -> None:
-        self.bar = tqdm(total=total, desc=title, disable=not show, mininterval=0.5)
+    bar: Bar
 
     def __enter__(self) -> Callable[[float], None]:
+        self.bar.__enter__()
         return self._report
 
     def _report(self, rms: float) -> None:
-        if not self.bar.disable:
-            self.bar.set_postfix(error=f"{rms:.2g}", refresh=False)
-            self.bar.update()
+        self.bar.set_postfix_str(f"error={rms:.2g}", refresh=False)
+        self.bar.update()
 
     def __exit__(self, *_: object) -> None:
         self.bar.close()
@@ -51,7 +64,8 @@ class Checkpoint:
     @staticmethod
     def at(folder: str | Path, system: System, seed: int, settings: Settings, of: Mapping[str, Any]) -> Checkpoint:
         """Of networks for the same call, and what it found so far."""
-        meta = {"system": system.to_data(), "seed": seed, "settings": asdict(settings), **of}
+        kept = {name: value for name, value in asdict(settings).items() if name != "minutes"}
+        meta = {"system": system.to_data(), "seed": seed, "settings": kept, **of}
         return Checkpoint(Path(folder), meta)
 
     def _path(self, index: int) -> Path:

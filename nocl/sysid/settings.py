@@ -62,6 +62,8 @@ class Settings(Scaled):
     features: bool = flag(True, "look for polynomials in variables and sin, cos of angles")
     angles: bool = flag(True, "networks see angles as sin and cos")
     probes: int = count(64, "points at which the structure is looked for, for each variable")
+    minutes: float | None = positive(None, "of wall-clock time that the networks' fits are made to end in",
+                                     none="as long as they take")
 
     def budget(self, variables: int, plain: bool = False) -> Budget:
         """The budget of a network of so many variables."""

@@ -39,7 +39,7 @@ def better_affine(source: Source, found: Structure, settings: Settings, seed: in
     rows = sorted({i for group in found.groups for i in found.rows(group)})
     unit, errors = _size(gradient, source.box.width), []
     for parts, title in ((found, "trial"), (candidate, "trial, affine in the controls")):
-        weights = fit_groups(part, parts, short, seed, Progress(f"{bar.name}, {title}", bar.show), Checkpoint(None, {}))
+        weights = fit_groups(part, parts, short, seed, bar.trial(title), Checkpoint(None, {}))
         x, u = (torch.from_numpy(a) for a in np.split(z[kept], [source.box.nx], axis=1))
         slope = value_and_jacobian(assemble(parts, weights, settings.angles), x, u)[1]
         wrong = (slope - gradient[kept]) * source.box.width

@@ -33,16 +33,15 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.func import functional_call, stack_module_state
-from tqdm import tqdm
 
 from nocl import hjb
 from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
-from nocl.solvers.cnd.identity import identity
 from nocl.solvers.cnd.lifted import Lifted
-from nocl.solvers.cnd.settings import STEPS, PaperSettings
+from nocl.solvers.cnd.settings import STEPS, PaperSettings, identity
 from nocl.support import store
 from nocl.support.checks import Array
+from nocl.support.progress import bar as progress_bar
 from nocl.translate.arguments import Arguments
 from nocl.translate.fused import FusedStep
 from nocl.translate.torch_functions import to_torch
@@ -105,7 +104,7 @@ def train_paper(ocp: OCP, dynamics: Any = None, settings: PaperSettings | None =
     ----------
     dynamics : None for the exact f, a LearnedDynamics, or any torch callable (x [B, nx], u [B, nu][, p]) -> xdot
     seed : of initial networks and initial states; the caller's own generators are left alone
-    progress : a bar with the loss terms and the time left; None: where the terminal is one
+    progress : the loss terms and the time left, on stderr
     callback : called as callback(iteration, terms) after each iteration of the joint training
     checkpoint : a file that is written at each of 40 checks; the same call goes on from it, to the same result; plain
         callables are known by name
@@ -140,7 +139,7 @@ class Trainer:
                  draw: Callable[[int, np.random.Generator], Array] | None = None) -> None:
         self.draw = draw or ocp.initial_states.sample
         self.ocp, self.settings, self.device, self.dtype = ocp, settings, device, dtype
-        self.hidden = None if progress is None else not progress  # None: where the terminal is none
+        self.progress = progress
         self.f = _torch_dynamics(ocp, dynamics, device, dtype)
         self.L, self.G = to_torch(ocp.L_soft), to_torch(ocp.G)
         fused = settings.fused and settings.step == "rk4" and dynamics is None and torch.device(device).type == "cpu"
@@ -175,12 +174,14 @@ class Trainer:
         policy, parameters = side_by_side(self.starts)
         adam = torch.optim.Adam(parameters.values(), lr=s.learning_rate)
         recent: list[Tensor] = []
-        for _ in (bar := tqdm(range(s.race_iterations), f"{s.race} random controllers", disable=self.hidden)):
-            J = self.costs(policy, self.states(s.race, s.race_batch), hold=True).mean(1)
-            gradients = torch.autograd.grad(J.sum(), list(parameters.values()))
-            _step(adam, list(parameters.values()), _clip_each(gradients, s.clip))
-            recent = [*recent, J.detach()][-LAST:]
-            bar.set_postfix(cost=f"{float(J.detach().nan_to_num(math.inf).min()):.3g}")
+        with progress_bar(s.race_iterations, f"{s.race} random controllers", self.progress) as bar:
+            for _ in range(s.race_iterations):
+                J = self.costs(policy, self.states(s.race, s.race_batch), hold=True).mean(1)
+                gradients = torch.autograd.grad(J.sum(), list(parameters.values()))
+                _step(adam, list(parameters.values()), _clip_each(gradients, s.clip))
+                recent = [*recent, J.detach()][-LAST:]
+                bar.set_postfix_str(f"cost={float(J.detach().nan_to_num(math.inf).min()):.3g}", refresh=False)
+                bar.update()
         scores = torch.stack(recent).mean(0).nan_to_num(math.inf, posinf=math.inf)
         if not torch.isfinite(scores).any():
             raise ValueError(f"training diverged: all {s.race} random controllers have an infinite cost after "
@@ -243,11 +244,11 @@ class _Training:
         """All iterations that are left."""
         s, every = self.trainer.settings, max(1, self.trainer.settings.iterations // CHECKS)
         before, start = self.seconds, time.perf_counter()
-        with tqdm(total=s.iterations, initial=len(self.rows), desc=f"CND on {self.trainer.ocp.system.name}",
-                  disable=self.trainer.hidden) as bar:
+        with progress_bar(s.iterations, f"CND on {self.trainer.ocp.system.name}", self.trainer.progress,
+                          initial=len(self.rows)) as bar:
             while len(self.rows) < s.iterations and not (s.patience and self.best.waited >= s.patience):
                 named = self.iteration()
-                bar.set_postfix({name: f"{v:.3g}" for name, v in named.items()}, refresh=False)
+                bar.set_postfix_str(", ".join(f"{name}={v:.3g}" for name, v in named.items()), refresh=False)
                 bar.update()
                 if callback is not None:
                     callback(len(self.rows) - 1, named)

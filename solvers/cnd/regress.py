@@ -14,16 +14,22 @@ from torch import Tensor
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.cnd.labels import Labels
+from nocl.support.budget import ENDLESS, Budget
 from nocl.translate.torch_functions import to_torch
 
+LEAST = 50  # iterations, however small the budget
 SAME = 0.1  # squared error, in units of the controls' variance, within which a branch is taken for a label's own
 LossFunction = Callable[[Tensor], Tensor]  # row numbers of the labels -> a scalar
 OnStep = Callable[[float], Any]  # called once an iteration with the loss
 
 
 def fit_net(net: FeatureNet, loss: LossFunction, rows: int, *, iterations: int, batch: int, lr: float, seed: int,
-            report: OnStep = lambda _: None) -> None:
-    """Train net in place on random batches of row numbers; raises ValueError where the loss is not finite."""
+            report: OnStep = lambda _: None, budget: Budget = ENDLESS) -> None:
+    """Train net in place on random batches of row numbers; raises ValueError where the loss is not finite.
+
+    Where the budget is spent before the iterations are, it is the schedule: the rate falls with the share of it that is
+    spent, and at its end, after LEAST iterations, training ends.
+    """
     from pytorch_optimizer import SOAP
 
     generator = torch.Generator().manual_seed(seed)
@@ -31,7 +37,10 @@ def fit_net(net: FeatureNet, loss: LossFunction, rows: int, *, iterations: int, 
     parameters = list(net.parameters())
     optimizer = SOAP(parameters, lr=lr, betas=(0.95, 0.95), weight_decay=0.0, precondition_frequency=10)
     for i in range(iterations):
-        optimizer.param_groups[0]["lr"] = lr * min(1.0, (i + 1) / 50) * _cosine(i / iterations)
+        done = max(i / iterations, budget.share)
+        if done >= 1 and i >= LEAST:
+            break
+        optimizer.param_groups[0]["lr"] = lr * min(1.0, (i + 1) / 50) * _cosine(done)
         value = loss(torch.randint(rows, (batch,), generator=generator))
         if i % 100 == 0 and not torch.isfinite(value):
             raise ValueError(f"the loss is {value.item()} at iteration {i}: lower the learning rate (lr is {lr:g})")

@@ -1,4 +1,5 @@
-"""Settings of both training methods: the default's, and those of method="paper"."""
+"""Settings of both training methods, the default's and those of method="paper", and what tells a training by them from
+another: a checkpoint is taken up by the very same call only."""
 
 from __future__ import annotations
 
@@ -6,10 +7,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
+import torch
+
 from nocl import hjb
-from nocl.nets import ACTIVATIONS
+from nocl.nets import ACTIVATIONS, FeatureNet
+from nocl.ocp import OCP
 from nocl.support import checks
 from nocl.support.fields import Checked, Scaled, choice, coefficients, count, flag, nonnegative, positive, widths
+from nocl.support.fingerprint import fingerprint, json_text
+from nocl.translate.instructions import to_data
 from nocl.translate.rk4 import rk4_cost
 
 STEPS: dict[str, hjb.Step] = {"rk4": rk4_cost, "euler": hjb.euler_cost}
@@ -78,6 +84,8 @@ class TrainSettings(Scaled):
     gap_median: float = positive(2e-4, "stop once both are met: (J - J*) / J*, median over the held-out states")
     gap_p95: float = positive(1e-3, "and its 95th percentile")
     violating: float = nonnegative(0.01, "and this: the share of held-out runs that violate a constraint")
+    minutes: float | None = positive(None, "of wall-clock time that labels, rounds and fits are planned within",
+                                     none="as long as they take")
 
 
 def _times(value: Any, factor: float) -> Any:
@@ -120,3 +128,19 @@ class PaperSettings(Checked):
         if not self.hold and self.step != "rk4":
             raise ValueError(f"PaperSettings: step is {self.step!r} with hold=False; expected step='rk4', which "
                              "feedback in continuous time is integrated by")
+
+
+def identity(ocp: OCP, settings: Any, seed: int, f: Any, **more: str) -> str:
+    """What tells one training from another, as text: problem, settings but the time, seed and dynamics; f: the torch
+    dynamics that training uses."""
+    return json_text([ocp.to_data(), {k: v for k, v in asdict(settings).items() if k != "minutes"}, seed, _dynamics(f),
+                      more])
+
+
+def _dynamics(f: Any) -> str:
+    """A fingerprint of a network's maps and weights; the name of the function where f is none, as the exact f."""
+    net = getattr(f, "net", f)
+    if not isinstance(net, torch.nn.Module):
+        return "exact" if net is f else type(net).__name__
+    maps = [to_data(net.inputs), to_data(net.outputs)] if isinstance(net, FeatureNet) else [type(net).__name__]
+    return fingerprint(maps, *(parameter.detach().double().cpu().numpy() for parameter in net.parameters()))

@@ -6,7 +6,8 @@ The default method regresses the controller on optimal answers, and never differ
 2. optimal tails from a tube about these trajectories, all by batched DDP on the dynamics that training uses;
 3. regression of u(x, t) on the middle of every interval, so that the controller is feedback in continuous time;
 4. rounds: the states that the controller visits under kicks are solved too and added (DAgger, Ross et al. 2011), until
-   it meets the wanted gap on held-out initial states (after two rounds at least) or the rounds are used up;
+   it meets the wanted gap on held-out initial states (after two rounds at least), or two rounds in a row did not pay,
+   or rounds or time are used up (nocl.solvers.cnd.plan);
 5. V(x, t) by regression on the costs-to-go and their gradients, the costates.
 """
 
@@ -14,7 +15,6 @@ from __future__ import annotations
 
 import copy
 import os
-import sys
 import time
 import warnings
 from collections.abc import Iterator
@@ -26,7 +26,6 @@ from typing import TYPE_CHECKING, Any
 import casadi as ca
 import numpy as np
 import torch
-from tqdm import tqdm
 
 from nocl.data import Solution
 from nocl.exports import parity
@@ -36,22 +35,26 @@ from nocl.sampling import own_numbers
 from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.features import at_rate, own_features, policy_net
 from nocl.solvers.cnd.held import Held
-from nocl.solvers.cnd.identity import identity
 from nocl.solvers.cnd.in_torch import InTorch
 from nocl.solvers.cnd.labels import KEPT, NEIGHBOURS, Labels, Problems, answered, at_other_rates, rivals, tube, visited
 from nocl.solvers.cnd.laws import LawTraining, check_law
 from nocl.solvers.cnd.paper import PaperSettings, train_paper
+from nocl.solvers.cnd.plan import KICKED, PAYS, VALUE_HELD_OUT, Plan, measured, missed_by, stalled
+from nocl.solvers.cnd.plan import iterations as planned_iterations
 from nocl.solvers.cnd.regress import fit_net, policy_loss
-from nocl.solvers.cnd.settings import TrainSettings
+from nocl.solvers.cnd.settings import TrainSettings, identity
 from nocl.solvers.cnd.validate import (
     advice,
     cannot_hold,
     feasible,
+    floored_by,
     gap,
     held_gap,
     held_out,
     held_out_optima,
     kicked_optima,
+    labels_gap,
+    solved_again,
     summary,
     tube_optima,
     value_scores,
@@ -63,8 +66,11 @@ from nocl.solvers.ddp.opinion import second_opinion
 from nocl.solvers.ddp.solver import DDP, substeps_for
 from nocl.substeps import FINE
 from nocl.support import checks, store
+from nocl.support.budget import ENDLESS, Budget
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
+from nocl.support.progress import Bar, say, shown
+from nocl.support.progress import bar as progress_bar
 from nocl.support.threads import one_thread
 
 if TYPE_CHECKING:
@@ -74,14 +80,13 @@ if TYPE_CHECKING:
 __all__ = ["TrainSettings", "train"]
 CHECKPOINT = "training.safetensors"
 VALUE_LARGE = 0.05  # mean |V - J*| / J* that a warning is given above
-VALUE_HELD_OUT = 16  # times held_out: a mean of relative errors hangs on the few states that are hard
 MARGINS = 2  # rounds that begin with new margins, where there are constraints
 LOSSES = 40  # of each regression that the card keeps
 REHEARSED = (16, 16)  # points inside the box, and corners, at which an export is tried before training
 
 
 def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "default",
-          settings: TrainSettings | PaperSettings | None = None, seed: int = 0,
+          settings: TrainSettings | PaperSettings | None = None, seed: int = 0, minutes: float | None = None,
           out: str | os.PathLike[str] | None = None, progress: bool | None = None, features: Any = None) -> CND:
     """Train a controller and a value function for all of an OCP's initial states.
 
@@ -95,18 +100,26 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
     settings : TrainSettings, or PaperSettings with method="paper"
         Default: TrainSettings.of("normal", parameters=ocp.np).
     seed : int
-        The same seed gives the same controller on the same machine.
+        The same seed gives the same controller on the same machine, where there is no limit of minutes.
+    minutes : float, optional
+        Of wall-clock time, in place of settings.minutes: labels, rounds and fits are planned within it, and the best
+        controller so far is returned; card["minutes"] and card["stopped"] say so. The default method alone has it.
     out : folder, optional
         Where checkpoints go: a call with the same arguments goes on from the last one.
     progress : bool, optional
-        Whether to show progress; by default where the terminal is one.
+        Whether to show an estimate of the time, and progress: a bar on a terminal, elsewhere a line at least every 10
+        s. Default: True.
     features : SX expressions in states, parameters and nocl.time(), optional
         What the networks see beside nocl's own features, where the user knows what matters: the angle to an obstacle,
         the energy. Finite all over X.
     """
+    begin = time.monotonic()
     _check(ocp, dynamics, seed, out)
     checks.word(method, ("default", "paper"), "method", "train")
     if method == "paper":
+        if minutes is not None:
+            raise ValueError("train: minutes are for the default method; 'paper' has PaperSettings(patience=...) and "
+                             "iterations: leave them out")
         ocp.refuse_constraints(f"train with method={method!r}",
                                "train by the default method, or solve it by NMPC or DDP")
         chosen = _expect(settings, PaperSettings)
@@ -118,10 +131,23 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
     own = own_features(ocp, features)
     usual = TrainSettings.of("normal", parameters=ocp.np)
     chosen = usual if settings is None else _expect(settings, TrainSettings)
+    chosen = chosen if minutes is None else replace(chosen, minutes=minutes)
     if ocp.is_free:
         check_law(ocp, dynamics, chosen)
         return LawTraining(ocp, chosen, seed, progress, own).run()
-    return Training(ocp, dynamics, chosen, seed, out, progress, own).run()
+    return Training(ocp, dynamics, chosen, seed, out, progress, own, begin).run()
+
+
+def estimate(ocp: OCP, settings: TrainSettings, seed: int = 0) -> str:
+    """How long a training on the exact f takes on this machine, in words, from a few solves and iterations.
+
+    Raises ValueError for problems that training refuses.
+    """
+    ocp.refuse_free("an estimate of training")
+    with one_thread():
+        run = Training(ocp, None, settings, seed, None, False)
+        costs = measured(ocp, run.ddp, run.fine, run.in_torch, settings)
+    return str(Plan(settings, costs, parameters=ocp.np > 0, margins=run.held is not None))
 
 
 def _check(ocp: OCP, dynamics: LearnedDynamics | None, seed: int, out: str | os.PathLike[str] | None) -> None:
@@ -147,8 +173,10 @@ class Training:
     """One run of the default method; its state between rounds is what a checkpoint holds."""
 
     def __init__(self, ocp: OCP, dynamics: LearnedDynamics | None, settings: TrainSettings, seed: int,
-                 out: str | os.PathLike[str] | None, progress: bool | None, own: ca.Function | None = None) -> None:
-        self.own = own
+                 out: str | os.PathLike[str] | None, progress: bool | None, own: ca.Function | None = None,
+                 begin: float | None = None) -> None:
+        self.own, self.progress = own, progress
+        self.begin = time.monotonic() if begin is None else begin  # what the budget counts from
         self.ocp, self.settings, self.seed = ocp, settings, seed
         self.learned = dynamics is not None
         self.in_torch = InTorch(ocp, dynamics)
@@ -162,12 +190,13 @@ class Training:
         self.solved: list[Solution] = []  # what the labels are of, where constraints have margins that may change
         self._inside(None if self.held is None else self.held.first)
         self.checkpoint = None if out is None else Path(out) / CHECKPOINT
-        self.hidden_progress = None if progress is None else not progress
         self.round, self.seconds, self.fitting, self.fitting_cpu, self.evaluations = 0, 0.0, 0.0, 0.0, 0
         self.history: list[dict[str, Any]] = []
         self.losses: list[float] = []
         self.value_card: dict[str, Any] = {}
         self.opinion: dict[str, Any] = {}  # of NMPC, where it was asked for one
+        self.best: tuple[float, int, dict[str, Any]] | None = None  # how far from the goals, the round, the weights
+        self.stopped = "the goals are met"
 
     def _inside(self, margin: Array | None) -> None:
         """Labels keep these margins from now on."""
@@ -179,32 +208,88 @@ class Training:
             return self._run()
 
     def _run(self) -> CND:
-        s = self.settings
-        if not self._resume():
+        s, there = self.settings, self._resume()
+        self._plan()
+        if not there:
             self._first_labels()
             self._network()
             self._rehearse_export()
-        while self.round <= s.rounds and not self._good_enough():
+        while self._goes_on():
             if self.round:
                 self._move_margins()
                 self._visit()
-            self._regress(s.iterations * (2 if self.round >= max(s.least_rounds, 1) else 1))
+            self._regress()
             self._validate()
             self.round += 1
             self._save()
-        if (remark := advice(self.history[-1], self.round - 1, s.held_out, s.violating)) is not None:
-            warnings.warn(f"{self.ocp.system.name}: {remark}", stacklevel=4)
+        self._end_rounds()
         value = self._value() if s.value else None
         cnd = CND(self.ocp, self.net, value, self._card())
-        if self._shown() and cnd.continuous_angles:
-            tqdm.write(f"{self.ocp.system.name}: the controller expects {', '.join(cnd.continuous_angles)} as a "
-                       "continuous angle, since the problem tells turns apart; cnd.unwrapped() takes it in (-pi, pi]",
-                       file=sys.stderr)
+        if cnd.continuous_angles:
+            say(f"{self.ocp.system.name}: the controller expects {', '.join(cnd.continuous_angles)} as a "
+                "continuous angle, since the problem tells turns apart; cnd.unwrapped() takes it in (-pi, pi]",
+                self.progress)
         return cnd
 
+    def _plan(self) -> None:
+        """How long it takes, where someone wants to know, and what there is time for."""
+        s = self.settings
+        budget = ENDLESS if s.minutes is None else \
+            Budget(60 * s.minutes, spent_before=self.seconds + time.monotonic() - self.begin)
+        costs = None
+        if budget.limited or (shown(self.progress) and not self.round):
+            costs = measured(self.ocp, self.ddp, self.fine, self.in_torch, s, self.own)
+        self.plan = Plan(s, costs, budget, parameters=self.ocp.np > 0, margins=self.held is not None)
+        if not self.round:
+            say(f"{self.ocp.system.name}: training takes {self.plan}", self.progress)
+
+    def _goes_on(self) -> bool:
+        """Whether there is another round, and if not why."""
+        s = self.settings
+        if self._good_enough():
+            return False
+        if self.round > s.rounds:
+            self.stopped = f"{s.rounds} rounds are used up"
+        elif self.round and not self.plan.another(self.round):
+            self.stopped = f"no time for a further round within {s.minutes:g} minutes"
+        elif self.held is None and stalled(self.history, s):
+            self.stopped = "the last two rounds did not pay"
+        else:
+            return True
+        return False
+
+    def _end_rounds(self) -> None:
+        """Takes the best round's controller where time or gain ended them, and says what is missing and why."""
+        s, row, floor = self.settings, self.history[-1], ""
+        if not self._meets(row):
+            floor = self._floor(row)
+            if self.best is not None and self.best[1] != row["round"] and self.round <= s.rounds:
+                self.net.load_state_dict(self.best[2])
+                row = self.history[self.best[1]]
+            say(f"{self.ocp.system.name}: {self.stopped}; gap {100 * row['gap_median']:.3g} %, 95th percentile "
+                f"{100 * row['gap_p95']:.3g} %, wanted {100 * s.gap_median:g} and {100 * s.gap_p95:g} %: {floor}",
+                self.progress)
+        self.chosen = row
+        if (remark := advice(row, self.round - 1, s.held_out, s.violating, floor)) is not None:
+            warnings.warn(f"{self.ocp.system.name}: {remark}", stacklevel=5)
+
+    def _floor(self, row: dict[str, Any]) -> str:
+        """What keeps the gap where it is, from the labels' own plans as feedback on held-out states; kept in `row`."""
+        s = self.settings
+        fresh = Problems.initial(self.ocp, s.held_out, self._rng(1_000_000))
+        labels = extend(self.ddp, self.bank, fresh.x, p=fresh.given_p)
+        labels = labels[labels.success]
+        best = solved_again(self.fine, labels)
+        labels, best = labels[best.success], best[best.success]
+        if not len(best):
+            return "no held-out state was solved"
+        lost = summary(labels_gap(self.in_torch, labels, best, self.fine.substeps), "labels")["labels_median"]
+        row["floor"] = {"labels_median": lost, "by": floored_by(row, lost, s.intervals, s.gap_median)}
+        return str(row["floor"]["by"])
+
     def _first_labels(self) -> None:
-        s, rng = self.settings, self._rng(0)
-        with self._stage("labels", s.starts + 6) as bar:
+        s, rng = self.plan.within("labels"), self._rng(0)
+        with self._solving("labels", 0, s, "labels", s.starts + 6) as bar:
             def report(what: str) -> None:
                 bar.set_postfix_str(what, refresh=False)
                 bar.update()
@@ -231,14 +316,11 @@ class Training:
             return seeds
         said = second_opinion(self.ddp, seeds)
         self.opinion = said.card
-        if said.text and self._shown():
-            tqdm.write(f"{self.ocp.system.name}: {said.text}", file=sys.stderr)
+        if said.text:
+            say(f"{self.ocp.system.name}: {said.text}", self.progress)
         if not said.improved:
             return seeds
         return solve_globally(self.ddp, seeds.x[:, 0], p=seeds.p, starts=0, known=said.solution, seed=self.seed)
-
-    def _shown(self) -> bool:
-        return sys.stderr.isatty() if self.hidden_progress is None else not self.hidden_progress
 
     def _held(self, solution: Solution) -> Solution:
         """Without success where constraints are lost."""
@@ -290,8 +372,8 @@ class Training:
             self.bank = replace(SolutionBank.of(self.ddp, self.solved[0]), several=self.bank.several)
 
     def _visit(self) -> None:
-        s, rng = self.settings, self._rng(self.round)
-        with self._stage(f"round {self.round}: visited states", 1) as bar:
+        s, rng = self.plan.within("visits", self.round), self._rng(self.round)
+        with self._solving("visits", self.round, s, f"round {self.round}: visited states", 1) as bar:
             around = self._hardest(rng) if self.ocp.np else None
             solved = visited(self.ddp, self.bank, self.policy, self.in_torch, s.visits, s.kick, rng, around)
             self.labels = Labels.join([self.labels, self._labels(solved, rng)])
@@ -312,24 +394,24 @@ class Training:
         self.labels = Labels.join([self.labels, self._labels(best, rng)])
         return hard
 
-    def _regress(self, iterations: int) -> None:
-        s = self.settings
+    def _regress(self) -> None:
+        s, iterations = self.settings, planned_iterations(("controller", self.round), self.settings)
         loss = policy_loss(self.ocp, self.net, self.inverse, self.labels)
         with self._stage(f"round {self.round}: controller", iterations, fits=True) as bar:
             report = _Reporter(bar, iterations)
             fit_net(self.net, loss, len(self.labels), iterations=iterations, batch=s.batch, lr=s.lr,
-                    seed=self.seed + self.round, report=report)
+                    seed=self.seed + self.round, report=report, budget=self.plan.time("controller", self.round))
         self.losses = report.kept
 
     def _validate(self) -> None:
         """The gap to the optimum as continuous-time feedback, on initial states that no label starts from, and
         on states of kicked rollouts."""
-        s, rng = self.settings, self._rng(1_000_000)
-        with self._stage("held-out states", 1) as bar:
+        s, rng = self.plan.within("check", self.round), self._rng(1_000_000)
+        with self._solving("check", self.round, s, "held-out states", 1) as bar:
             solvers, acting = (self.ddp, self.fine, self.bank), (self.policy, self.in_torch)
             fresh = held_out(*solvers, Problems.initial(self.ocp, s.held_out, rng))
             starts = fresh[fresh.success]
-            tails = kicked_optima(*solvers, *acting, 4 * s.held_out, s.kick, rng)
+            tails = kicked_optima(*solvers, *acting, KICKED * s.held_out, s.kick, rng)
             row = {"round": self.round, "labels": len(self.labels), "loss": self.losses,
                    "unsolved": s.held_out - len(starts) - cannot_hold(fresh),
                    **summary(gap(*acting, starts, substeps=self.fine.substeps), "gap"),
@@ -344,6 +426,9 @@ class Training:
                                 f"kicked {100 * row['kicked_median']:.3f} %")
             bar.update()
         self.history.append(row)
+        missed = missed_by(row, s)
+        if self.best is None or missed < self.best[0]:
+            self.best = missed, row["round"], copy.deepcopy(self.net.state_dict())
 
     def _violations(self, starts: Solution, tails: Solution) -> dict[str, Any]:
         """What the policy violates on held-out states, and the margins that follow from it."""
@@ -359,7 +444,10 @@ class Training:
     def _good_enough(self) -> bool:
         if self.round <= self.settings.least_rounds:
             return False
-        last, s = self.history[-1], self.settings
+        return self._meets(self.history[-1])
+
+    def _meets(self, last: dict[str, Any]) -> bool:
+        s = self.settings
         met = bool(last["gap_median"] <= s.gap_median and last["gap_p95"] <= s.gap_p95)
         return met and (self.held is None or last["gap_violating"] <= s.violating)
 
@@ -368,7 +456,7 @@ class Training:
         s, rng, losses, tried = self.settings, self._rng(2_000_000), list[float](), list[float]()
         labels, optima = ValueLabels.of(on_fine_grid(self.fine, self.bank.solution)), self._value_optima()
         for attempt in range(s.value_rounds):
-            labels = ValueLabels.join([labels, self._value_labels(rng)])
+            labels = ValueLabels.join([labels, self._value_labels(rng, attempt)])
             if attempt == 0:
                 with _seeded(self.seed + 1):
                     net = value_net(self.ocp, labels, s.hidden, self.own)
@@ -378,7 +466,9 @@ class Training:
             tried.append(worst if np.isfinite(worst) else np.inf)
             if len(tried) == 1 or tried[-1] < min(tried[:-1]):
                 best, weights = scores, copy.deepcopy(net.state_dict())
-            if tried[-1] <= s.value_error:
+            if tried[-1] <= s.value_error or not self.plan.another_value(attempt + 1):
+                break
+            if attempt and tried[-1] > (1 - PAYS) * tried[-2]:  # more labels do not pay
                 break
         net.load_state_dict(weights)
         if not min(tried) <= VALUE_LARGE:
@@ -392,10 +482,10 @@ class Training:
     def _value_optima(self) -> dict[str, Solution]:
         """What V is judged on: initial states, states of the tube, and states of kicked rollouts, solved anew; where
         there are path constraints, those that can hold them."""
-        s, rng = self.settings, self._rng(3_000_000)
+        s, rng = self.plan.within("value check"), self._rng(3_000_000)
         solvers, n = (self.ddp, self.fine, self.bank), VALUE_HELD_OUT * s.held_out
         acting = (self.policy, self.in_torch)
-        with self._stage("held-out states for V", 3) as bar:
+        with self._solving("value check", 0, s, "held-out states for V", 3) as bar:
             sets = {"initial": held_out_optima(*solvers, Problems.initial(self.ocp, n, rng))}
             bar.update()
             sets["tube"] = tube_optima(*solvers, *acting, n, s.width, rng)
@@ -405,9 +495,9 @@ class Training:
         held = sets if self.held else {name: feasible(self.ocp, optima) for name, optima in sets.items()}
         return {name: optima for name, optima in held.items() if len(optima)} or sets
 
-    def _value_labels(self, rng: np.random.Generator) -> ValueLabels:
-        s = self.settings
-        with self._stage("value labels", 1) as bar:
+    def _value_labels(self, rng: np.random.Generator, attempt: int) -> ValueLabels:
+        s = self.plan.within("value labels", attempt)
+        with self._solving("value labels", attempt, s, "value labels", 1) as bar:
             found = value_tails(self.ddp, self.bank, self.policy, self.in_torch, initial=s.value_initial,
                                 tails=s.value_tails, visits=s.value_visits, width=s.width, kick=s.kick, rng=rng)
             labels = ValueLabels.of(on_fine_grid(self.fine, found))
@@ -416,34 +506,49 @@ class Training:
 
     def _fit_value(self, net: FeatureNet, labels: ValueLabels, attempt: int) -> list[float]:
         s = self.settings
-        iterations = s.value_iterations * (2 if attempt else 1)
+        iterations = planned_iterations(("value fit", attempt), s)
         loss = value_loss(net.float(), labels, self.bank.scale[:self.ocp.system.nx])
         with self._stage("value function" + (", once more" if attempt else ""), iterations, fits=True) as bar:
             report = _Reporter(bar, iterations)
             fit_net(net, loss, len(labels), iterations=iterations, batch=s.batch, lr=s.lr, seed=self.seed + attempt,
-                    report=report)
+                    report=report, budget=self.plan.time("value fit", attempt))
         return report.kept
 
     def _card(self) -> dict[str, Any]:
-        last, own = self.history[-1], {} if self.own is None else {"features": self.own.numel_out(0)}
+        last, own = self.chosen, {} if self.own is None else {"features": self.own.numel_out(0)}
         return {"method": "default", "dynamics": "learned" if self.learned else "exact", "seed": self.seed,
                 **{name: last[name] for name in ("gap_median", "gap_p95", "kicked_median", "kicked_p95", "unsolved")},
                 **{name: last[name] for name in ("gap_violating", "kicked_violating", "infeasible") if name in last},
-                "seconds": round(self.seconds, 1),
+                "round": last["round"], "stopped": self.stopped, "seconds": round(self.seconds, 1),
                 "fitting_seconds": round(self.fitting, 1),  # of these, fits of networks; the others solve problems
                 "fitting_cpu_seconds": round(self.fitting_cpu, 1),
                 "dynamics_evaluations": self._evaluations(), "substeps": self.substeps,
                 **({"second_opinion": self.opinion} if self.opinion else {}),
-                "settings": asdict(self.settings), **own, "history": self.history, "value": self.value_card}
+                "settings": asdict(self.settings), **own, **self._time_card(), "history": self.history,
+                "value": self.value_card}
+
+    def _time_card(self) -> dict[str, Any]:
+        """The minutes that were asked for, and those since `train` was called, with those before a checkpoint."""
+        if not self.plan.budget.limited:
+            return {}
+        return {"minutes": self.settings.minutes, "minutes_taken": round(self.plan.budget.spent / 60, 2)}
 
     def _evaluations(self) -> int:
         """Of f, in rollouts of DDP, one for each state; those before a checkpoint included."""
         return self.evaluations + sum(ddp.evaluations["rollout"] for ddp in (self.ddp, self.fine))
 
     @contextmanager
-    def _stage(self, name: str, total: int, fits: bool = False) -> Iterator[tqdm[Any]]:
+    def _solving(self, stage: str, number: int, settings: TrainSettings, name: str, total: int) -> Iterator[Bar]:
+        """A stage of solves, with the settings that the plan gave it."""
+        start = time.perf_counter()
+        with self._stage(name, total) as bar:
+            yield bar
+        self.plan.took(stage, number, settings, time.perf_counter() - start)
+
+    @contextmanager
+    def _stage(self, name: str, total: int, fits: bool = False) -> Iterator[Bar]:
         start, cpu = time.perf_counter(), time.process_time()
-        with tqdm(total=total, desc=name, disable=self.hidden_progress, leave=True) as bar:
+        with progress_bar(total, f"{self.ocp.system.name}: {name}", self.progress) as bar:
             yield bar
         took = time.perf_counter() - start
         self.seconds, self.fitting = self.seconds + took, self.fitting + took * fits
@@ -461,13 +566,16 @@ class Training:
             return
         state = {"policy": self.net.state_dict(), "labels": _tensors(vars(self.labels)),
                  "bank": _tensors({k: v for k, v in vars(self.bank.solution).items() if k != "message"})}
+        if self.best is not None:
+            state["best"] = self.best[2]
         for i, s in enumerate(self.solved):
             state[f"solved-{i}"] = _tensors({k: v for k, v in s.arrays().items() if k != "message"})
         meta = {"identity": self._identity(), "solved": len(self.solved),
                 "margin": None if self.margin is None else self.margin.tolist(),
                 "opinion": self.opinion, "round": self.round, "history": self.history, "seconds": self.seconds,
                 "fitting": self.fitting, "fitting_cpu": self.fitting_cpu,
-                "first": self.first, "several": self.bank.several, "evaluations": self._evaluations()}
+                "first": self.first, "several": self.bank.several, "evaluations": self._evaluations(),
+                "best": None if self.best is None else self.best[:2]}
         self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
         store.save_checkpoint(self.checkpoint, state, meta)
 
@@ -487,6 +595,8 @@ class Training:
         self.round, self.history, self.first = meta["round"], meta["history"], meta["first"]
         self.seconds, self.fitting, self.fitting_cpu = meta["seconds"], meta["fitting"], meta["fitting_cpu"]
         self.evaluations, self.opinion = meta.get("evaluations", 0), meta.get("opinion", {})
+        if meta.get("best") is not None:
+            self.best = *meta["best"], state["best"]
         self._network()
         self.net.double().load_state_dict(state["policy"])
         self.net.eval().requires_grad_(False)
@@ -501,7 +611,7 @@ def _converged(arrays: dict[str, Array]) -> Solution:
 class _Reporter:
     """Told the loss of each iteration: moves the bar, and keeps LOSSES means over as many stretches."""
 
-    def __init__(self, bar: tqdm[Any], iterations: int) -> None:
+    def __init__(self, bar: Bar, iterations: int) -> None:
         self.bar, self.every, self.kept = bar, max(iterations // LOSSES, 1), list[float]()
         self.recent: list[float] = []
 

@@ -18,6 +18,7 @@ from nocl.solvers.ddp.bank import SolutionBank, extend
 from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
 
+FLOOR = 0.5  # of the gap, that explains it
 NODES = 16  # of each solution at which the HJB residual is taken
 
 
@@ -80,6 +81,55 @@ def gap(policy: Policy, torch_ocp: InTorch, best: Solution, unit: float = 0.0, s
     return shares
 
 
+def own_feedback(plans: Solution, steps: int) -> Policy:
+    """Each plan itself as feedback in continuous time, for `steps` RK4 steps from where the plans start, row by row.
+
+    Controls by monotone cubics through the middles of the intervals, where labels stand, the plan's states by cubic
+    splines through its nodes, its gains held: what a network would be that had learned the labels, and no more.
+    """
+    from scipy.interpolate import CubicSpline, PchipInterpolator  # 0.3 s
+
+    K = plans.u.shape[1]
+    share = np.linspace(0.0, 1.0, 2 * steps + 1)
+    controls = PchipInterpolator((np.arange(K) + 0.5) / K, plans.u, axis=1, extrapolate=True)(share)
+    states = CubicSpline(np.arange(K + 1) / K, plans.x, axis=1)(share)
+    gains = plans.gain[:, np.minimum((share * K + 1e-9).astype(int), K - 1)]
+    u, x, gain = (torch.from_numpy(np.ascontiguousarray(z)) for z in (controls, states, gains))
+    t0, left = (torch.from_numpy(z.copy()) for z in (plans.t[:, 0], plans.t[:, -1] - plans.t[:, 0]))
+
+    def policy(state: Tensor, t: Tensor, *_: Tensor) -> Tensor:
+        k = int(torch.round((t[0, 0] - t0[0]) / left[0] * 2 * steps).clamp(0, 2 * steps))
+        return u[:, k] + torch.einsum("bij,bj->bi", gain[:, k], state - x[:, k])
+
+    return policy
+
+
+def labels_gap(torch_ocp: InTorch, labels: Solution, best: Solution, substeps: int = 1) -> Array:
+    """(J - J*) / |J*| [B] of labels' plans, on their own grid, as feedback, where `best` are the optima from there."""
+    s, steps = torch_ocp.ocp.system, substeps * best.u.shape[1]
+    follow = own_feedback(labels, steps)
+    low, high = (torch.from_numpy(np.array(b, dtype=np.float64)) for b in (s.lbu, s.ubu))
+    return gap(lambda x, t, *p: torch.clamp(follow(x, t, *p), low, high), torch_ocp, best, substeps=substeps)
+
+
+def floored_by(row: dict[str, Any], labels: float, intervals: int, goal: float) -> str:
+    """What keeps the last round's gap where it is, with what to try.
+
+    labels : the median gap of the labels' own plans as feedback
+    """
+    median = row["gap_median"]
+    if labels > max(goal, FLOOR * median):
+        return (f"its labels' own plans, on {intervals} intervals, cost {100 * labels:.2g} % more than the optimum "
+                f"when followed: the grid floors the gap, more intervals lower it (--intervals {2 * intervals}, "
+                f"TrainSettings(intervals={2 * intervals}))")
+    if median > goal and row["loss"] and row["loss"][-1] > FLOOR * median:
+        return ("the network misses its own labels by as much: wider layers (hidden=(128, 128, 128)) or more "
+                "iterations lower the gap")
+    if median > goal:
+        return "states that the labels do not cover: more visits, tails or states lower the gap"
+    return "a few states, as where optima of several kinds meet: more seeds and states, or branches=2, lower their gap"
+
+
 def held_gap(policy: Policy, torch_ocp: InTorch, best: Solution, substeps: int = 1) -> Array:
     """The same of a policy that is asked at the solutions' nodes and held; they start at t = 0."""
     here, K = torch_ocp.at(best.parameters), best.u.shape[1]
@@ -140,8 +190,11 @@ def _hjb(value: FeatureNet, policy: Policy, torch_ocp: InTorch, tails: Solution)
     return {"hjb_median": float(np.median(residual)) / usual, "hjb_mean": float(residual.mean()) / usual}
 
 
-def advice(row: dict[str, Any], rounds: int, held_out: int, violating: float = 1.0) -> str | None:
-    """What to say, and to try, where the last round's gap is large or few states tell it; None where it is well."""
+def advice(row: dict[str, Any], rounds: int, held_out: int, violating: float = 1.0, floor: str = "") -> str | None:
+    """What to say, and to try, where the last round's gap is large or few states tell it; None where it is well.
+
+    floor : what is known to keep the gap where it is, said in place of what may help
+    """
     if row["unsolved"] > 0.1 * held_out:
         return (f"{row['unsolved']} of {held_out} held-out initial states could not be solved, the gap is that of the "
                 "others: try TrainSettings with more seeds and starts, or more intervals where the dynamics are fast")
@@ -157,4 +210,4 @@ def advice(row: dict[str, Any], rounds: int, held_out: int, violating: float = 1
              "more seeds and states, where basins of different optima meet, or wider layers")
     return (f"the controller costs {100 * row['gap_median']:.2g} % more than the optimum (median; 95th percentile "
             f"{100 * row['gap_p95']:.2g} %) on held-out initial states after {rounds} rounds; expected less than 1 %: "
-            f"try TrainSettings with {tries}")
+            f"{floor or 'try TrainSettings with ' + tries}")

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -19,7 +18,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from tqdm import tqdm
 
 from nocl.data import Solution
 from nocl.judge.laws import dynamics_function
@@ -34,6 +32,8 @@ from nocl.solvers.starts import HALVINGS, near, random_start, smooth, spread_hor
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
+from nocl.support.progress import bar as progress_bar
+from nocl.support.progress import shown
 
 OnMessage = Callable[[str], None]  # told what is being done
 DRAWS = 32  # points from which equilibria are looked for
@@ -73,7 +73,7 @@ def solve_globally(ddp: DDP, x0: ArrayLike, *, p: Any = None, starts: int = 16, 
     number, folder = int(np.random.default_rng(seed).integers(2**62)), None if out is None else Path(out)
     key = "" if out is None else fingerprint(ddp.key, rows, number, (starts, neighbours, rounds),
                                              *([] if known is None else [known.u]), *([values] if ddp.ocp.np else []))
-    states = _States(ddp, rows, values, number, workers, folder, sys.stderr.isatty() if progress is None else progress)
+    states = _States(ddp, rows, values, number, workers, folder, shown(progress))
     t = np.linspace(0, ddp.ocp.longest, ddp.intervals + 1)  # of a free horizon shares alone count
     search = _Kept(states, mirrors(ddp.ocp, ddp.dynamics), t, folder, key, report, neighbours=neighbours,
                    rounds=rounds, seed=number, known=known, p=values)
@@ -227,8 +227,8 @@ class _States:
     def _solve(self, rows: Rows, guess: Callable[[slice], Guess]) -> Found:
         """Solve states `rows` from guess(part of rows), as many at a time as fit."""
         n = max(1, BYTES // bytes_each(self.ddp, False))
-        with tqdm(total=len(rows), desc=self.what, unit="state", delay=3.0, leave=False,
-                  disable=not self.show or len(rows) <= n) as bar:
+        with progress_bar(len(rows), self.what, self.show and len(rows) > n, unit="state", delay=3.0,
+                          leave=False) as bar:
             for at in (slice(i, i + n) for i in range(0, len(rows), n)):
                 self.slices += 1
                 folder = None if self.folder is None else self.folder / f"stage-{self.number:03d}-{self.slices:05d}"

@@ -11,7 +11,6 @@ differential dynamic programming, ICRA 2014.
 from __future__ import annotations
 
 import os
-import sys
 import warnings
 from collections import Counter
 from dataclasses import replace
@@ -43,6 +42,7 @@ from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
 from nocl.support.pool import Journal, Pool, stream
+from nocl.support.progress import shown
 
 if TYPE_CHECKING:
     from nocl.sysid.identification import LearnedDynamics
@@ -176,7 +176,7 @@ class DDP:
         curvature : whether to return V_xx
         workers : "auto" (this process, `threads` of it), a number of threads, or "tcp://...", a Dask scheduler
         out : a folder that gets each piece of the batch as soon as it is solved: the same call resumes what is there
-        progress : a bar on stderr; default: where that is a terminal
+        progress : on stderr: a bar on a terminal, else a line every 10 s; default: True
 
         Raises ValueError before any work for wrong shapes, x0 that is not finite and t0 outside [0, horizon). A problem
         whose guess blows up, or that finds no minimum, has success False, cost inf and a message; the others go on.
@@ -190,7 +190,7 @@ class DDP:
         guess = self._guesses(len(rows), u=u, x=x, gain=gain, t=t)
         journal = Journal(None if out is None else Path(out),
                           self._run_key(rows, times, values, guess, curvature) if out else "", "DDP")
-        show = sys.stderr.isatty() if progress is None else progress
+        show = shown(progress)
         tasks = pieces(self, rows, times, guess, curvature, values)
         solution = assembled(len(rows), stream(Job(here), tasks, pool, journal, show, f"DDP, {self.ocp.system.name}"))
         return self._held_against_plant(solution)

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import itertools
 import math
-import sys
 import time
 import warnings
 from collections.abc import Callable, Sequence
@@ -27,12 +26,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import NdBSpline, make_interp_spline
-from tqdm import tqdm
 
 from nocl.hamiltonian import minimiser
 from nocl.ocp import OCP
 from nocl.support import checks, store
 from nocl.support.checks import Array
+from nocl.support.progress import bar as progress_bar
+from nocl.support.progress import shown
 
 try:
     import hj_reachability as hj
@@ -148,7 +148,7 @@ class LevelSet:
         with jax.enable_x64(True):
             advance, V, prediction = self._ready()
             start, kept, times = time.perf_counter(), [np.asarray(V, dtype=np.float32)], self.t[::-1]
-            with tqdm(total=round(self.ocp.horizon, 3), desc="level sets", unit="s", disable=not progress) as bar:
+            with progress_bar(round(self.ocp.horizon, 3), "level sets", progress, unit="s") as bar:
                 for before, now in itertools.pairwise(times):
                     V = advance(before, V, now)
                     kept.append(np.asarray(V, dtype=np.float32))
@@ -318,7 +318,7 @@ def standard(ocp: OCP) -> LevelSet:
 
 def standard_solution(ocp: OCP) -> LevelSetSolution:
     """V on that grid, solved."""
-    return standard(ocp).solve(progress=sys.stderr.isatty())
+    return standard(ocp).solve(progress=shown(None))
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -35,6 +34,7 @@ from nocl.support import checks, compiler
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
 from nocl.support.pool import Journal, Pool, do
+from nocl.support.progress import shown
 
 KEPT = 32  # programs kept in memory
 PROBES = 3  # states on which more substeps are tried where nothing was solved
@@ -232,7 +232,7 @@ class NMPC:
         workers : 1, a number of processes, "auto": processes where the measured cost of the first states says that
             they pay; or "tcp://...", a Dask scheduler
         out : a folder that gets each state's outcome as soon as it is there: the same call resumes what is there
-        progress : a bar on stderr; default: where that is a terminal
+        progress : on stderr: a bar on a terminal, else a line every 10 s; default: True
 
         Returns a Solution with a row for each state, the same for any `workers`. Its `seconds`, `iterations`, `starts`
         and `optima` cover all that was tried. A state without a solution has success False, cost inf, and the message
@@ -254,7 +254,7 @@ class NMPC:
         n = checks.whole(starts, "starts", "NMPC.solve") if starts is not None else (0 if given else self.starts)
         if n < 1 and not given:
             raise ValueError(f"starts is {n}; expected at least 1, or guesses")
-        show = sys.stderr.isatty() if progress is None else progress
+        show = shown(progress)
         call = _Call(rows, t, values, given, warm, n, self.passes if n else 0, Pool(workers),
                      None if out is None else Path(out), show)
         solution = self._settle(call) if self.substeps is None else self._told(self._search(call))
