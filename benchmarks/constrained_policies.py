@@ -35,8 +35,8 @@ from nocl.data import Solution
 from nocl.judge import simulate
 from nocl.ocp import OCP
 from nocl.solvers.cnd import CND, TrainSettings
-from nocl.solvers.cnd.in_torch import InTorch
-from nocl.solvers.cnd.labels import Problems, policy_controls
+from nocl.solvers.cnd.regression.in_torch import InTorch
+from nocl.solvers.cnd.regression.labels import Problems, policy_controls
 from nocl.solvers.ddp.bank import SolutionBank, better, extend
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP

@@ -39,8 +39,8 @@ from nocl.judge import Simulation, simulate
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.cnd import TrainSettings
-from nocl.solvers.cnd.in_torch import InTorch
-from nocl.solvers.cnd.labels import Problems, policy_controls
+from nocl.solvers.cnd.regression.in_torch import InTorch
+from nocl.solvers.cnd.regression.labels import Problems, policy_controls
 from nocl.solvers.cnd.validate import feasible, kicked_optima, tube_optima, value_scores
 from nocl.solvers.ddp.bank import SolutionBank, better
 from nocl.solvers.ddp.global_search import solve_globally

@@ -31,7 +31,7 @@ import provenance
 
 import nocl
 from nocl.solvers import NMPC
-from nocl.solvers.cnd.labels import tube_states
+from nocl.solvers.cnd.regression.labels import tube_states
 from nocl.solvers.ddp.bank import SolutionBank
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP

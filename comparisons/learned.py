@@ -17,7 +17,7 @@ from nocl.comparisons.baselines import base_cost
 from nocl.comparisons.methods import Solving, Starts
 from nocl.constraints import TOLERANCE
 from nocl.data import Solution
-from nocl.judge import simulate
+from nocl.judge.simulation import simulate
 from nocl.ocp import OCP
 from nocl.scales import usual_sizes
 from nocl.solvers.ddp.global_search import solve_globally

@@ -11,9 +11,9 @@ import torch
 import nocl
 from nocl.exports.bundle import export
 from nocl.solvers.cnd import TrainSettings
-from nocl.solvers.cnd.features import policy_net
-from nocl.solvers.cnd.labels import Labels
-from nocl.solvers.cnd.regress import SAME, fit_net, policy_loss
+from nocl.solvers.cnd.regression.features import policy_net
+from nocl.solvers.cnd.regression.labels import Labels
+from nocl.solvers.cnd.regression.regress import SAME, fit_net, policy_loss
 
 
 def signs(n: int = 4000, seed: int = 0) -> Labels:
@@ -80,7 +80,7 @@ def test_files_keep_the_branches(two: tuple[nocl.CND, float], tmp_path: Path) ->
 
 
 def test_the_branch_with_the_largest_number_is_taken() -> None:
-    from nocl.solvers.cnd.features import _chosen
+    from nocl.solvers.cnd.regression.features import _chosen
 
     rng = np.random.default_rng(0)
     y = ca.SX.sym("y", 3 * 2 + 3)

@@ -10,8 +10,8 @@ import nocl
 from nocl.judge import simulate
 from nocl.solvers import cnd as package
 from nocl.solvers.cnd import CND
-from nocl.solvers.cnd.features import policy_net
-from nocl.solvers.cnd.labels import Labels
+from nocl.solvers.cnd.regression.features import policy_net
+from nocl.solvers.cnd.regression.labels import Labels
 from nocl.solvers.cnd.value import ValueLabels, value_net
 
 SIZES = (8, 8)

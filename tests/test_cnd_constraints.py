@@ -14,9 +14,9 @@ from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
 from nocl.solvers.cnd import CND, TrainSettings
 from nocl.solvers.cnd.held import FIRST, LARGEST, LOST, Held
-from nocl.solvers.cnd.in_torch import InTorch
-from nocl.solvers.cnd.labels import Labels, Problems
-from nocl.solvers.cnd.projection import projected, retracted
+from nocl.solvers.cnd.regression.in_torch import InTorch
+from nocl.solvers.cnd.regression.labels import Labels, Problems
+from nocl.solvers.cnd.regression.projection import projected, retracted
 from nocl.solvers.cnd.training import Training
 from nocl.solvers.ddp.solver import DDP
 from nocl.solvers.ddp.without_compiler import NumpyKernel

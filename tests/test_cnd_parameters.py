@@ -14,9 +14,9 @@ from movers import mover
 import nocl
 from nocl.solvers import DDP, NMPC, solve_globally
 from nocl.solvers.cnd import CND, TrainSettings
-from nocl.solvers.cnd.features import features
-from nocl.solvers.cnd.in_torch import InTorch
-from nocl.solvers.cnd.labels import Labels, Problems, kicked_states, near, rivals
+from nocl.solvers.cnd.regression.features import features
+from nocl.solvers.cnd.regression.in_torch import InTorch
+from nocl.solvers.cnd.regression.labels import Labels, Problems, kicked_states, near, rivals
 from nocl.solvers.cnd.training import Training
 from nocl.solvers.ddp.bank import SolutionBank
 

@@ -8,9 +8,9 @@ import pytest
 
 import nocl
 from nocl.solvers import DDP
-from nocl.solvers.cnd.in_torch import InTorch
-from nocl.solvers.cnd.labels import Labels
 from nocl.solvers.cnd.laws import Switches
+from nocl.solvers.cnd.regression.in_torch import InTorch
+from nocl.solvers.cnd.regression.labels import Labels
 from nocl.solvers.cnd.settings import TrainSettings
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.nodes import NodeBank

@@ -9,8 +9,8 @@ from movers import mover
 
 import nocl
 from nocl.solvers.cnd import TrainSettings
-from nocl.solvers.cnd.features import features, own_features
-from nocl.solvers.cnd.labels import Problems
+from nocl.solvers.cnd.regression.features import features, own_features
+from nocl.solvers.cnd.regression.labels import Problems
 
 QUICK = replace(TrainSettings.of("quick"), seeds=20, states=0, tails=20, visits=20, rounds=0, iterations=60,
                 hidden=(8,), value_tails=20, value_iterations=40, value_rounds=1)

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import nocl
-from nocl.solvers.cnd.features import features
-from nocl.solvers.cnd.labels import Labels
+from nocl.solvers.cnd.regression.features import features
+from nocl.solvers.cnd.regression.labels import Labels
 from nocl.solvers.ddp.bank import SolutionBank, extend
 from nocl.solvers.ddp.solver import DDP
 from nocl.solvers.lqr import LQR

@@ -10,9 +10,9 @@ import torch
 
 import nocl
 from nocl.solvers.cnd import TrainSettings
-from nocl.solvers.cnd.in_torch import InTorch
 from nocl.solvers.cnd.plan import SCALED, Costs, Plan, iterations, measured, missed_by, stages, stalled
-from nocl.solvers.cnd.regress import LEAST, fit_net
+from nocl.solvers.cnd.regression.in_torch import InTorch
+from nocl.solvers.cnd.regression.regress import LEAST, fit_net
 from nocl.solvers.cnd.validate import floored_by, labels_gap, solved_again
 from nocl.solvers.ddp.solver import DDP
 from nocl.support.budget import Budget

@@ -10,8 +10,8 @@ from lq import rk4_lq
 import nocl
 from nocl.judge import simulate
 from nocl.solvers.cnd import TrainSettings
-from nocl.solvers.cnd.features import at_rate, policy_net
-from nocl.solvers.cnd.labels import LONGEST, Labels, at_other_rates, tube
+from nocl.solvers.cnd.regression.features import at_rate, policy_net
+from nocl.solvers.cnd.regression.labels import LONGEST, Labels, at_other_rates, tube
 from nocl.solvers.ddp.bank import SolutionBank
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP

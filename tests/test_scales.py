@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 import nocl
 from nocl.solvers import DDP, LQR, NMPC
-from nocl.solvers.cnd.features import features
-from nocl.solvers.cnd.labels import Labels
+from nocl.solvers.cnd.regression.features import features
+from nocl.solvers.cnd.regression.labels import Labels
 from nocl.solvers.ddp.global_search import equilibria, solve_globally
 
 X0 = np.array([1.5, -0.5])

@@ -16,9 +16,9 @@ from nocl.judge import simulate
 from nocl.nets import MLP, FeatureNet
 from nocl.solvers import LQR, NMPC
 from nocl.solvers.cnd import TrainSettings
-from nocl.solvers.cnd.features import policy_net
-from nocl.solvers.cnd.in_torch import InTorch
-from nocl.solvers.cnd.labels import (
+from nocl.solvers.cnd.regression.features import policy_net
+from nocl.solvers.cnd.regression.in_torch import InTorch
+from nocl.solvers.cnd.regression.labels import (
     SMALL,
     Labels,
     Problems,
@@ -28,7 +28,7 @@ from nocl.solvers.cnd.labels import (
     policy_controls,
     tube,
 )
-from nocl.solvers.cnd.regress import fit_net, policy_loss
+from nocl.solvers.cnd.regression.regress import fit_net, policy_loss
 from nocl.solvers.cnd.validate import advice, gap, refined, summary, value_scores
 from nocl.solvers.cnd.value import ROUND, ValueLabels, on_fine_grid, value_loss, value_net, value_tails
 from nocl.solvers.ddp.bank import SolutionBank, extend
@@ -605,7 +605,7 @@ def test_a_file_is_no_folder_for_checkpoints(tmp_path):
 
 def test_visited_states_are_kept_in_a_box_that_ends_at_zero(pendulum):
     """Far out is measured by the larger bound; where every state is, it is said."""
-    from nocl.solvers.cnd.labels import kicked_states, visited
+    from nocl.solvers.cnd.regression.labels import kicked_states, visited
 
     ocp, _, _, _ = pendulum
     s = ocp.system

@@ -26,8 +26,8 @@ from nocl.exports.parity import Certificate, ExportPart
 from nocl.judge.laws import dynamics_function
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
-from nocl.solvers.cnd.features import at_rate, folded
-from nocl.solvers.cnd.labels import LONGEST
+from nocl.solvers.cnd.regression.features import at_rate, folded
+from nocl.solvers.cnd.regression.labels import LONGEST
 from nocl.solvers.cnd.unwrapped import Unwrapped
 from nocl.support import checks
 from nocl.support.checks import Array

@@ -20,9 +20,9 @@ import torch
 from nocl.constraints import TOLERANCE
 from nocl.data import Solution
 from nocl.ocp import OCP
-from nocl.solvers.cnd.in_torch import InTorch
-from nocl.solvers.cnd.labels import Policy, Problems, continuous_run
-from nocl.solvers.cnd.projection import projected
+from nocl.solvers.cnd.regression.in_torch import InTorch
+from nocl.solvers.cnd.regression.labels import Policy, Problems, continuous_run
+from nocl.solvers.cnd.regression.projection import projected
 from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
 

@@ -25,10 +25,10 @@ from nocl.judge.simulation import simulate
 from nocl.ocp import OCP
 from nocl.sampling import own_numbers
 from nocl.solvers.cnd.controller import CND
-from nocl.solvers.cnd.features import net_on, without_clock
-from nocl.solvers.cnd.in_torch import InTorch
-from nocl.solvers.cnd.labels import Labels, Problems
-from nocl.solvers.cnd.regress import fit_net, policy_loss
+from nocl.solvers.cnd.regression.features import net_on, without_clock
+from nocl.solvers.cnd.regression.in_torch import InTorch
+from nocl.solvers.cnd.regression.labels import Labels, Problems
+from nocl.solvers.cnd.regression.regress import fit_net, policy_loss
 from nocl.solvers.cnd.settings import TrainSettings
 from nocl.solvers.cnd.validate import summary
 from nocl.solvers.ddp.global_search import solve_globally

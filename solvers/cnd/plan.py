@@ -21,10 +21,10 @@ import torch
 
 from nocl.ocp import OCP
 from nocl.sampling import own_numbers
-from nocl.solvers.cnd.features import at_rate, policy_net
-from nocl.solvers.cnd.in_torch import InTorch
-from nocl.solvers.cnd.labels import NEIGHBOURS, PROBED, Labels, Problems, continuous_cost, tube
-from nocl.solvers.cnd.regress import LossFunction, fit_net, policy_loss
+from nocl.solvers.cnd.regression.features import at_rate, policy_net
+from nocl.solvers.cnd.regression.in_torch import InTorch
+from nocl.solvers.cnd.regression.labels import NEIGHBOURS, PROBED, Labels, Problems, continuous_cost, tube
+from nocl.solvers.cnd.regression.regress import LossFunction, fit_net, policy_loss
 from nocl.solvers.cnd.settings import TrainSettings
 from nocl.solvers.cnd.validate import refined
 from nocl.solvers.cnd.value import ValueLabels, value_loss, value_net

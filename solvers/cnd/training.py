@@ -33,15 +33,25 @@ from nocl.nets import FeatureNet
 from nocl.ocp import OCP
 from nocl.sampling import own_numbers
 from nocl.solvers.cnd.controller import CND
-from nocl.solvers.cnd.features import at_rate, own_features, policy_net
 from nocl.solvers.cnd.held import Held
-from nocl.solvers.cnd.in_torch import InTorch
-from nocl.solvers.cnd.labels import KEPT, NEIGHBOURS, Labels, Problems, answered, at_other_rates, rivals, tube, visited
 from nocl.solvers.cnd.laws import LawTraining, check_law
 from nocl.solvers.cnd.paper import PaperSettings, train_paper
 from nocl.solvers.cnd.plan import KICKED, PAYS, VALUE_HELD_OUT, Plan, measured, missed_by, stalled
 from nocl.solvers.cnd.plan import iterations as planned_iterations
-from nocl.solvers.cnd.regress import fit_net, policy_loss
+from nocl.solvers.cnd.regression.features import at_rate, own_features, policy_net
+from nocl.solvers.cnd.regression.in_torch import InTorch
+from nocl.solvers.cnd.regression.labels import (
+    KEPT,
+    NEIGHBOURS,
+    Labels,
+    Problems,
+    answered,
+    at_other_rates,
+    rivals,
+    tube,
+    visited,
+)
+from nocl.solvers.cnd.regression.regress import fit_net, policy_loss
 from nocl.solvers.cnd.settings import TrainSettings, identity
 from nocl.solvers.cnd.validate import (
     advice,

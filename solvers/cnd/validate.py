@@ -12,8 +12,16 @@ from nocl.data import Solution
 from nocl.hjb import hjb_residual
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
-from nocl.solvers.cnd.in_torch import InTorch
-from nocl.solvers.cnd.labels import SMALL, Policy, Problems, answered, continuous_cost, kicked_states, tube_states
+from nocl.solvers.cnd.regression.in_torch import InTorch
+from nocl.solvers.cnd.regression.labels import (
+    SMALL,
+    Policy,
+    Problems,
+    answered,
+    continuous_cost,
+    kicked_states,
+    tube_states,
+)
 from nocl.solvers.ddp.bank import SolutionBank, extend
 from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array

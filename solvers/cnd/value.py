@@ -19,11 +19,11 @@ from torch import Tensor
 from nocl.data import Solution
 from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
-from nocl.solvers.cnd.features import features
-from nocl.solvers.cnd.in_torch import InTorch
-from nocl.solvers.cnd.labels import Policy, Problems, answered, kicked_states, tube_states
 from nocl.solvers.cnd.loss_kernel import ValueKernel
-from nocl.solvers.cnd.regress import LossFunction
+from nocl.solvers.cnd.regression.features import features
+from nocl.solvers.cnd.regression.in_torch import InTorch
+from nocl.solvers.cnd.regression.labels import Policy, Problems, answered, kicked_states, tube_states
+from nocl.solvers.cnd.regression.regress import LossFunction
 from nocl.solvers.cnd.validate import refined
 from nocl.solvers.ddp.bank import SolutionBank
 from nocl.solvers.ddp.solver import DDP

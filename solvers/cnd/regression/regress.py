@@ -13,7 +13,7 @@ from torch import Tensor
 
 from nocl.nets import FeatureNet
 from nocl.ocp import OCP
-from nocl.solvers.cnd.labels import Labels
+from nocl.solvers.cnd.regression.labels import Labels
 from nocl.support.budget import ENDLESS, Budget
 from nocl.translate.torch_functions import to_torch
 

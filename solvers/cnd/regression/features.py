@@ -17,13 +17,13 @@ import numpy as np
 from nocl.nets import MLP, FeatureNet
 from nocl.ocp import OCP
 from nocl.scales import usual_sizes
-from nocl.solvers.cnd.projection import retracted
+from nocl.solvers.cnd.regression.projection import retracted
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.translate.arguments import Arguments
 
 if TYPE_CHECKING:
-    from nocl.solvers.cnd.labels import Labels
+    from nocl.solvers.cnd.regression.labels import Labels
 
 DEGREE = 6  # of the polynomials in time
 CONSTANT = 1e-6  # of its usual size: what varies less is as good as constant

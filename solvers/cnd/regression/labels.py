@@ -14,7 +14,7 @@ from torch import Tensor
 from nocl.data import Solution
 from nocl.ocp import OCP
 from nocl.sampling import Uniform, box
-from nocl.solvers.cnd.in_torch import InTorch
+from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.ddp.bank import Rows, SolutionBank, better, extend
 from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
