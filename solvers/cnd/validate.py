@@ -87,7 +87,7 @@ def own_feedback(plans: Solution, steps: int) -> Policy:
     Controls by monotone cubics through the middles of the intervals, where labels stand, the plan's states by cubic
     splines through its nodes, its gains held: what a network would be that had learned the labels, and no more.
     """
-    from scipy.interpolate import CubicSpline, PchipInterpolator  # 0.3 s
+    from scipy.interpolate import CubicSpline, PchipInterpolator  # scipy
 
     K = plans.u.shape[1]
     share = np.linspace(0.0, 1.0, 2 * steps + 1)
