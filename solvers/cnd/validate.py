@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.interpolate import CubicSpline, PchipInterpolator
 from torch import Tensor
 
 from nocl.data import Solution
@@ -95,8 +96,6 @@ def own_feedback(plans: Solution, steps: int) -> Policy:
     Controls by monotone cubics through the middles of the intervals, where labels stand, the plan's states by cubic
     splines through its nodes, its gains held: what a network would be that had learned the labels, and no more.
     """
-    from scipy.interpolate import CubicSpline, PchipInterpolator  # 0.3 s
-
     K = plans.u.shape[1]
     share = np.linspace(0.0, 1.0, 2 * steps + 1)
     controls = PchipInterpolator((np.arange(K) + 0.5) / K, plans.u, axis=1, extrapolate=True)(share)
