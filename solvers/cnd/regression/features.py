@@ -9,6 +9,7 @@ depends on p in the same units as the state, and the path constraints, which tel
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import casadi as ca
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 DEGREE = 6  # of the polynomials in time
 CONSTANT = 1e-6  # of its usual size: what varies less is as good as constant
 NEAR = 0.01  # of a usual size: distances that small are told apart
+SHARP = 0.1  # of the numbers of branches: differences within which they share
 LEAST_TIME = 0.025  # of the horizon: time to go is never counted as less
 Part = tuple[ca.SX, Array | float]  # features [k], and the usual size of each
 
@@ -201,20 +203,27 @@ def net_on(ocp: OCP, phi: ca.Function, labels: Labels, sizes: tuple[int, ...],
     mean, spread = ca.DM(labels.u.mean(axis=0)), ca.DM(labels.u.std(axis=0) + 1e-9 * usual_sizes(ocp).u)
     said = branches * (s.nu + 1) if branches > 1 else s.nu
     y, u = ca.SX.sym("y", said), ca.SX.sym("u", s.nu)
-    clipped = ca.fmin(ca.fmax(mean + spread * _chosen(y, s.nu, branches), ca.DM(s.lbu)), ca.DM(s.ubu))
-    outputs = Arguments.of(phi).function("controls", {"u": retracted(ocp, clipped)}, y=y)
+
+    def clipped(own: ca.SX) -> ca.SX:
+        return ca.fmin(ca.fmax(mean + spread * own, ca.DM(s.lbu)), ca.DM(s.ubu))
+
+    said_u = _blended(y, s.nu, branches, clipped)
+    outputs = Arguments.of(phi).function("controls", {"u": retracted(ocp, said_u)}, y=y)
     net = FeatureNet(phi, [MLP([phi.numel_out(0), *sizes, said])], outputs)
     return net, ca.Function("inverse", [u], [(u - mean) / spread], ["u"], ["y"])
 
 
-def _chosen(y: ca.SX, nu: int, branches: int) -> ca.SX:
-    """The branch with the largest number, of y = (y_1, y_2, ..., numbers)."""
-    numbers = y[branches * nu:] if branches > 1 else y[:1]
-    best, most = y[:nu], numbers[0]
-    for k in range(1, branches):
-        best = ca.if_else(numbers[k] > most, y[k * nu:(k + 1) * nu], best)
-        most = ca.fmax(most, numbers[k])
-    return best
+def _blended(y: ca.SX, nu: int, branches: int, answer: Callable[[ca.SX], ca.SX]) -> ca.SX:
+    """The answers of y = (y_1, y_2, ..., numbers), each by its share: the softmax of the numbers over SHARP.
+
+    That is one branch alone, but where another takes over: there the law is steep and continuous. One that jumps can
+    hold a run where it jumps back and forth, which no integrator gets through.
+    """
+    if branches < 2:
+        return answer(y)
+    numbers = y[branches * nu:]
+    share = ca.exp((numbers - ca.mmax(numbers)) / SHARP)
+    return sum(share[k] * answer(y[k * nu:(k + 1) * nu]) for k in range(branches)) / ca.sum1(share)
 
 
 def at_rate(net: FeatureNet, dt: float) -> FeatureNet:
