@@ -2,9 +2,12 @@
 
 import io
 import sys
+import warnings
 
 import pytest
 
+import nocl
+from nocl.solvers.cnd import TrainSettings
 from nocl.support import progress
 from nocl.support.budget import Budget
 from nocl.support.progress import EVERY, Log, Stage, in_words
@@ -50,6 +53,28 @@ def test_short_stages_one_after_the_other_are_told_too(log):
         clock.now += 4
         stage.update()
     assert len(lines) == 1
+
+
+def test_what_is_asked_for_holds_for_work_within():
+    assert progress.shown(None)
+    with progress.within(False):
+        assert not progress.shown(None)
+        assert progress.shown(True)
+        with progress.within(None):
+            assert not progress.shown(None)
+        with progress.within(True):
+            assert progress.shown(None)
+        assert not progress.shown(None)
+    assert progress.shown(None)
+
+
+def test_a_training_without_progress_says_nothing(capfd, monkeypatch):
+    monkeypatch.setattr(progress, "EVERY", 0.0)  # whatever is shown would be told
+    settings = TrainSettings.of("quick", seeds=4, states=10, tails=20, visits=10, iterations=20, value=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        nocl.train(nocl.load_ocp("double_integrator"), settings=settings, progress=False)
+    assert capfd.readouterr().err == ""
 
 
 def test_a_line_has_all_stages_the_outermost_first(log):

@@ -9,7 +9,9 @@ from __future__ import annotations
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any, Protocol, Self
 
 from tqdm import tqdm
@@ -27,9 +29,22 @@ class Bar(Protocol):
     def close(self) -> Any: ...
 
 
+_QUIET: ContextVar[bool] = ContextVar("quiet", default=False)
+
+
+@contextmanager
+def within(progress: bool | None) -> Iterator[None]:
+    """What is asked for holds for all work within, where that asks for nothing itself."""
+    before = _QUIET.set(_QUIET.get() if progress is None else not progress)
+    try:
+        yield
+    finally:
+        _QUIET.reset(before)
+
+
 def shown(progress: bool | None) -> bool:
-    """Whether progress is shown: where nothing is asked for, wherever there is a stderr."""
-    return sys.stderr is not None if progress is None else progress and sys.stderr is not None
+    """Whether progress is shown: where nothing is asked for, here or around, wherever there is a stderr."""
+    return sys.stderr is not None and (not _QUIET.get() if progress is None else progress)
 
 
 def bar(total: float, title: str, progress: bool | None = None, *, unit: str = "it", initial: float = 0,

@@ -17,7 +17,6 @@ import casadi as ca
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from nocl.constraints import TOLERANCE
 from nocl.data import Solution
@@ -36,6 +35,8 @@ from nocl.solvers.ddp.nodes import NodeBank
 from nocl.solvers.ddp.solver import DDP, substeps_for
 from nocl.substeps import FINE
 from nocl.support.checks import Array
+from nocl.support.progress import Bar, within
+from nocl.support.progress import bar as progress_bar
 from nocl.support.threads import one_thread
 
 AT_BOUND = 1e-3  # of the width of U: closer controls are at a bound
@@ -109,7 +110,7 @@ class LawTraining:
     def __init__(self, ocp: OCP, settings: TrainSettings, seed: int, progress: bool | None,
                  own: ca.Function | None, switches: bool = True) -> None:
         self.ocp, self.settings, self.seed, self.own, self.switches = ocp, settings, seed, own, switches
-        self.hidden_progress = None if progress is None else not progress
+        self.progress = progress
         substeps = settings.substeps or substeps_for(ocp, None, settings.intervals, FINE)
         self.ddp = DDP(ocp, intervals=settings.intervals, substeps=substeps)
         self.loose = DDP(ocp.loosened(TOLERANCE), intervals=4 * settings.intervals, substeps=-(-substeps // 4))
@@ -117,7 +118,7 @@ class LawTraining:
         self.round, self.seconds, self.history = 0, 0.0, list[dict[str, Any]]()
 
     def run(self) -> CND:
-        with one_thread():
+        with one_thread(), within(self.progress):
             return self._run()
 
     def _run(self) -> CND:
@@ -251,6 +252,6 @@ class LawTraining:
                 "settings": asdict(self.settings), "history": self.history}
 
     @contextmanager
-    def _stage(self, name: str, total: int) -> Iterator[tqdm[Any]]:
-        with tqdm(total=total, desc=name, disable=self.hidden_progress, leave=True) as bar:
+    def _stage(self, name: str, total: int) -> Iterator[Bar]:
+        with progress_bar(total, name, self.progress) as bar:
             yield bar

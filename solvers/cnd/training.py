@@ -79,7 +79,7 @@ from nocl.support import checks, store
 from nocl.support.budget import ENDLESS, Budget
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
-from nocl.support.progress import Bar, say, shown
+from nocl.support.progress import Bar, say, shown, within
 from nocl.support.progress import bar as progress_bar
 from nocl.support.threads import one_thread
 
@@ -154,7 +154,7 @@ def estimate(ocp: OCP, settings: TrainSettings, seed: int = 0) -> str:
     Raises ValueError for problems that training refuses.
     """
     ocp.refuse_free("an estimate of training")
-    with one_thread():
+    with one_thread(), within(False):
         run = Training(ocp, None, settings, seed, None, False)
         costs = measured(ocp, run.ddp, run.fine, run.in_torch, settings)
     return str(Plan(settings, costs, parameters=ocp.np > 0, margins=run.held is not None))
@@ -214,7 +214,7 @@ class Training:
         self.ddp = self.plain if margin is None or self.held is None else self.held.solver(self.plain, margin)
 
     def run(self) -> CND:
-        with one_thread():
+        with one_thread(), within(self.progress):
             return self._run()
 
     def _run(self) -> CND:
