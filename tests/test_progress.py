@@ -2,12 +2,11 @@
 
 import io
 import sys
-import warnings
 
 import pytest
 
 import nocl
-from nocl.solvers.cnd import TrainSettings
+from nocl.solvers.cnd.training import Training
 from nocl.support import progress
 from nocl.support.budget import Budget
 from nocl.support.progress import EVERY, Log, Stage, in_words
@@ -68,13 +67,12 @@ def test_what_is_asked_for_holds_for_work_within():
     assert progress.shown(None)
 
 
-def test_a_training_without_progress_says_nothing(capfd, monkeypatch):
-    monkeypatch.setattr(progress, "EVERY", 0.0)  # whatever is shown would be told
-    settings = TrainSettings.of("quick", seeds=4, states=10, tails=20, visits=10, iterations=20, value=False)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        nocl.train(nocl.load_ocp("double_integrator"), settings=settings, progress=False)
-    assert capfd.readouterr().err == ""
+@pytest.mark.parametrize("asked", [True, False])
+def test_solves_within_a_training_say_what_it_says(asked, monkeypatch):
+    seen = []
+    monkeypatch.setattr(Training, "_run", lambda self: seen.append(progress.shown(None)))
+    nocl.train(nocl.load_ocp("double_integrator"), progress=asked)
+    assert seen == [asked]
 
 
 def test_a_line_has_all_stages_the_outermost_first(log):
