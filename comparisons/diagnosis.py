@@ -26,6 +26,7 @@ from nocl.solvers.ddp.solver import DDP
 from nocl.solvers.grid import fastest_at_start
 from nocl.solvers.mirrors import mirrors
 from nocl.solvers.nmpc.solver import NMPC
+from nocl.substeps import RK4
 from nocl.support import checks
 from nocl.support.checks import Array
 
@@ -216,12 +217,13 @@ def _solved(ddp: DDP, seed: int) -> Solution:
 
 def _grid(ddp: DDP, said: list[warnings.WarningMessage]) -> Finding:
     step, fastest = ddp.ocp.longest / ddp.intervals, fastest_at_start(ddp.ocp, ddp.ocp.functions)
-    text = (f"{ddp.substeps} Runge-Kutta step(s) in each of {ddp.intervals} intervals of {step:.3g}; the fastest time "
+    what = "Runge-Kutta" if ddp.integrator == RK4 else "implicit Radau"
+    text = (f"{ddp.substeps} {what} step(s) in each of {ddp.intervals} intervals of {step:.3g}; the fastest time "
             f"constant where it starts is {fastest:.3g}")
     coarse = [str(w.message) for w in said if "too coarse" in str(w.message)]
     if ddp.coarse:
         return Finding("integration", PROBLEM, coarse[-1] if coarse else text)
-    return Finding("integration", REMARK if ddp.substeps > 1 else OK, text)
+    return Finding("integration", REMARK if ddp.substeps > 1 or ddp.integrator != RK4 else OK, text)
 
 
 def _success(ddp: DDP, found: Solution, took: float) -> Finding:

@@ -281,7 +281,7 @@ def test_solve_fails_where_nothing_was_solved(here, capsys, solver):
     assert main(["solve", "wall.py", "--solver", solver, "--n", "2", "--intervals", "20", "--out", "new"]) == 2
     out, err = capsys.readouterr()
     assert f"{solver}: 0 of 2 solved" in out
-    assert err.startswith(f"nocl: error: {solver} solved none of 2 initial states; of the first: ")
+    assert err.splitlines()[-1].startswith(f"nocl: error: {solver} solved none of 2 initial states; of the first: ")
     assert ("'wall'" if solver == "ddp" else "infeasible") in err
     assert err.count("\n") == 1
     assert Path(f"new/solutions/{solver}.npz").exists()

@@ -257,11 +257,10 @@ def refusal_of(taker, ocp):
     return str(refused.value)
 
 
-@pytest.mark.parametrize("taker", ["simulate", "compare", "NMPC.controller"])
-def test_a_free_horizon_has_no_judge_and_no_loop(taker):
+@pytest.mark.parametrize("taker", ["study", "NMPC.controller"])
+def test_a_free_horizon_has_no_study_and_no_loop(taker):
     ocp = make(horizon=Free(0.5, 4))
-    call = {"simulate": lambda: nocl.simulate(ocp, np.zeros((1, 4, 1)), [1.0, 0.0]),
-            "compare": lambda: compare(ocp, {"none": lambda x, t: 0 * x[:, :1]}),
+    call = {"study": lambda: study(ocp, {"none": lambda x, t: 0 * x[:, :1]}),
             "NMPC.controller": lambda: NMPC(ocp, 4).controller()}[taker]
     with pytest.raises(ValueError, match=rf"^{taker} takes a number as horizon, but .*replace\(ocp, horizon=4\)"):
         call()

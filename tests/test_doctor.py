@@ -125,8 +125,8 @@ def test_time_scales_that_are_far_apart_are_no_lack_of_control():
 
 def test_a_coarse_grid_is_seen_where_constraints_are_held():
     _, by = said(cart((V, 600 * (U - V)), terminal=X**2, state_bounds={"v": (-0.9, 0.9)}))
-    assert by["integration"].verdict == PROBLEM
-    assert "too coarse" in by["integration"].text
+    assert by["integration"].verdict == REMARK
+    assert "implicit Radau step(s)" in by["integration"].text
 
 
 def test_a_stiff_plant_and_a_switch():

@@ -207,11 +207,12 @@ def test_a_training_on_a_budget_returns_the_best_so_far_and_says_so(monkeypatch)
     clock = Clock()
 
     def tick():
-        clock.now += 0.5
+        clock.now += 0.2
         return clock.now
 
     monkeypatch.setattr(module, "Budget", partial(Budget, clock=tick))
     monkeypatch.setattr(module, "measured", lambda *_: MACHINE)
+    monkeypatch.setattr(module, "stalled", lambda *_: False)
     cnd = nocl.train(nocl.load_ocp("double_integrator"), settings=replace(TINY, rounds=30, iterations=100), minutes=2,
                      progress=False)
     assert cnd.card["minutes"] == 2

@@ -200,7 +200,7 @@ def test_levenberg_marquardt_has_four_labels_a_weight(gradients, monkeypatch):
     """On one batch with fewer it meets them and swings between: acrobot by 1,000 values had 0.17 instead of 0.011."""
     seen = []
 
-    def spy(weights, draw, *, steps, batch, report):
+    def spy(weights, draw, *, steps, batch, report, **_):
         found, _ = draw(batch)
         seen.append((found.y.numel(), sum(w.numel() for w in weights)))
         return weights

@@ -16,6 +16,7 @@ from typing import Any, Protocol, Self
 
 from tqdm import tqdm
 
+SHORT = 1.0  # seconds that the outermost stage takes before anything is said of it
 EVERY = 10.0  # seconds between two lines, at most, and what a stage takes at least to be told when it ends
 
 
@@ -107,7 +108,10 @@ class Log:
 
     def due(self) -> None:
         """A line, where the last was EVERY seconds ago."""
-        if self.clock() - self.last < EVERY or not self.stages or not self._busy.acquire(blocking=False):
+        now = self.clock()
+        if now - self.last < EVERY or not self.stages or now - self.stages[0].begin < SHORT:
+            return
+        if not self._busy.acquire(blocking=False):
             return
         try:
             self.tell("; ".join(map(str, list(self.stages))))

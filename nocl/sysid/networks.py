@@ -49,7 +49,8 @@ def fit_groups(source: Source, parts: Structure, settings: Settings, seed: int, 
     for i in range(len(parts.groups)):
         done = checkpoint.get(i)
         if done is None:
-            done = fit_group(parts, pool, i, settings, seed, bar.part(work[i] / sum(work[i:])), None, found)
+            share = bar.part(work[i] / max(sum(work[i:]), 1e-300))
+            done = fit_group(parts, pool, i, settings, seed, share, None, found)
             checkpoint.put(i, done)
         weights.append(done)
     return weights

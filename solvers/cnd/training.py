@@ -205,6 +205,7 @@ class Training:
         self.losses: list[float] = []
         self.value_card: dict[str, Any] = {}
         self.opinion: dict[str, Any] = {}  # of NMPC, where it was asked for one
+        self.plan = Plan(settings, None, ENDLESS, parameters=ocp.np > 0, margins=self.held is not None)
         self.best: tuple[float, int, dict[str, Any]] | None = None  # how far from the goals, the round, the weights
         self.stopped = "the goals are met"
 
