@@ -8,7 +8,7 @@ import pytest
 
 import nocl
 from nocl.solvers import DDP
-from nocl.solvers.cnd.laws import Switches
+from nocl.solvers.cnd.laws import Switches, law_advice
 from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.cnd.regression.labels import Labels
 from nocl.solvers.cnd.settings import TrainSettings
@@ -113,10 +113,20 @@ def test_a_minimum_time_law_takes_nearly_the_least_time(tmp_path):
     np.testing.assert_allclose(cnd.to_casadi()(fresh.T, 0.0).full().T, cnd(fresh), atol=1e-12)
 
 
+def test_what_is_missing_of_a_law_is_said():
+    well = {"unsolved": 0, "arrived": 1.0, "gap_median": 1e-3, "gap_p95": 0.01}
+    assert law_advice(well, 32) is None
+    assert "4 of 32 held-out initial states" in law_advice(well | {"unsolved": 4}, 32)
+    assert "25 % of runs" in law_advice(well | {"arrived": 0.75}, 32)
+    assert "costs 2 % more" in law_advice(well | {"gap_median": 0.02}, 32)
+
+
 def test_what_no_law_can_be_had_of_is_refused():
     with pytest.raises(ValueError, match=r"holds the time, so that no u\(x\)"):
         nocl.train(problem(running=1 + 0.1 * nocl.time() * u**2))
     with pytest.raises(ValueError, match="no terminal constraints"):
         nocl.train(problem(terminal_constraints={}, scales={}))
+    with pytest.raises(ValueError, match="minutes are for problems whose horizon is a number"):
+        nocl.train(problem(), minutes=2)
     with pytest.raises(ValueError, match="control_dt"):
         nocl.train(problem(), settings=TrainSettings.of("quick", control_dt=True))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
@@ -57,6 +58,9 @@ def check_law(ocp: OCP, dynamics: Any, settings: TrainSettings) -> None:
     if not ocp.held_at_end:
         raise ValueError(f"train: the problem on {name!r} has a free horizon and no terminal constraints, so that a "
                          "law would not know where it ends; expected terminal_constraints, or a number as horizon")
+    if settings.minutes is not None:
+        raise ValueError(f"train: minutes are for problems whose horizon is a number, and that of {name!r} is free; "
+                         "expected none: fewer iterations, tails and visits take less time")
     if settings.control_dt:
         raise ValueError("train: control_dt=True is for problems whose horizon is a number; expected False: hold the "
                          "law's answers, simulate(..., hold=K)")
@@ -104,6 +108,21 @@ class Switches:
             replace(start, x=late.numpy(), u=self.after, weight=start.weight * (1 - self.share), dt=none)])
 
 
+def law_advice(row: dict[str, Any], held_out: int) -> str | None:
+    """What to say, and to try, where held-out runs do not arrive, or take long; None where it is well."""
+    tries = "try TrainSettings with more tails or visits, more iterations, wider layers, or branches=2"
+    if row["unsolved"] > 0.1 * held_out:
+        return (f"{row['unsolved']} of {held_out} held-out initial states were not solved, the gap is that of the "
+                "others: try TrainSettings with more seeds and starts")
+    if row["arrived"] < 1:
+        return (f"{100 * (1 - row['arrived']):.2g} % of runs from held-out initial states do not arrive within the "
+                f"longest horizon; {tries}")
+    if row["gap_median"] > 0.01 or row["gap_p95"] > 0.2:
+        return (f"the law costs {100 * row['gap_median']:.2g} % more than the optimum (median; 95th percentile "
+                f"{100 * row['gap_p95']:.2g} %) on held-out initial states; {tries}")
+    return None
+
+
 class LawTraining:
     """One run; without `switches` every interval is a label as any other."""
 
@@ -133,6 +152,8 @@ class LawTraining:
             self._keep_best()
             self.round += 1
         self.net.load_state_dict(self.weights)
+        if (remark := law_advice(self._best(), s.held_out)) is not None:
+            warnings.warn(f"{self.ocp.system.name}: {remark}", stacklevel=4)
         self.seconds = time.perf_counter() - begin
         return CND(self.ocp, self.net, None, self._card())
 

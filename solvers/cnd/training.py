@@ -115,7 +115,8 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
         Of wall-clock time, in place of settings.minutes: labels, rounds and fits are planned within it, and the best
         controller so far is returned; card["minutes"] and card["stopped"] say so. The default method alone has it.
     out : folder, optional
-        Where checkpoints go: a call with the same arguments goes on from the last one.
+        Where checkpoints go: a call with the same arguments goes on from the last one. A law of a problem whose horizon
+        is free is trained anew.
     progress : bool, optional
         Whether to show an estimate of the time, and progress: a bar on a terminal, elsewhere a line at least every 10
         s. Default: True.
