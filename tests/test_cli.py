@@ -337,10 +337,9 @@ def test_a_run_from_a_users_file_to_its_report(here, capsys, monkeypatch):
 
     with monkeypatch.context() as patch:  # an export that fails does not cost the report
         patch.setitem(parity.LIMITS, "float64", 0.0)
-        assert main([*RUN[:-3], "2", "--intervals", "10"]) == 2
+        assert main([*RUN[:-3], "2", "--intervals", "10"]) == 0  # what does not pass is left out
         out, err = capsys.readouterr()
-        assert "nothing was written: the export is not what was trained" in out
-        assert "differs from torch" in err
+        assert "differs from torch" in out + err
         assert "report: out/report/report.html" in out
 
     damaged = run / "dynamics" / "dynamics.safetensors"
@@ -362,7 +361,7 @@ def test_a_run_from_a_users_file_to_its_report(here, capsys, monkeypatch):
     assert (tree(run), run.stat().st_mtime_ns) == (before, changed)  # not even for a while
     assert not (here / "elsewhere" / "checkpoint").exists()
     out = capsys.readouterr().out
-    assert "CND on f_theta (20 holds)" in out
+    assert "CND (20 holds)" in out  # trained on the exact dynamics by now
     assert "on 2 initial states, drawn with seed 2" in out  # one more than that of the run
     assert main(["compare", "out", "--n", "2", "--methods", "CND", "--seed", "7"]) == 0
     assert "drawn with seed 8" in capsys.readouterr().out
