@@ -52,10 +52,6 @@ def levels(system: System, K: int, n: int, rng: np.random.Generator, parts: int)
 def random_start(ocp: OCP, K: int, n: int, seed: Seed, number: int, p: Array | None = None) -> Array:
     """Random start number 0, 1, 2, ... of n states, [n, K, nu]: smooth controls; of a problem without a goal by turns
     with such as are held over PARTS of the time.
-
-    On the bioreactor of docs/ddp.md these find the best optimum from 35 % of starts each, and from 69 % under the
-    feedback that holds an equilibrium; constants from 29 %, 20 parts from 4 %, and the best of 32 rollouts no more
-    often than one.
     """
     if ocp.has_goal or number % 2:
         return random_controls(ocp, K, n, seed, p)

@@ -8,6 +8,8 @@ Three kinds of control are judged alike:
   of K equal intervals, its answer held;
 - open loop, where it is an array u [B, K, nu]: held.
 
+Where the horizon is free feedback runs until it arrives, and plans to their own ends (arrival.py).
+
 On a problem with parameters they are functions of (x, t, p), p [B, np]; those of a problem without, of (x, t).
 
 The judge clips every control to U, and starts CVODES anew wherever a control or a state jumps. Constraints are judged

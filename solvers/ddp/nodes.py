@@ -29,9 +29,6 @@ class NodeBank:
             raise ValueError(f"no solution of {ocp.system.name!r} was found: {solution.message[0]}")
         self.scale = self.solution.x.std(axis=(0, 1)) + 1e-9 * (ocp.system.ubx - ocp.system.lbx)
 
-    def __len__(self) -> int:
-        return len(self.solution)
-
     def add(self, solution: Solution) -> NodeBank:
         """With further solutions."""
         return NodeBank(self.ocp, type(solution).join([self.solution, solution]))
