@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CLEAR = 0.1  # m between the car's obstacle and its goal, in the problems that are judged
+MARGIN = 0.015  # m that a policy is trained to stay away from the obstacle; with 0.005, 2 of 200 runs touched it by 0.003
 Bounds = dict[str, tuple[float, float]]
 
 
@@ -93,7 +94,8 @@ def _dubins() -> OCP:
     clear = dubins.distance(car, ca.vertcat(p["obstacle_x"], p["obstacle_y"]), p["radius"])
     return OCP.quadratic(car, p=ca.vertcat(*p.values()), horizon=8.0, x_goal=[*list(p.values())[3:]], u_goal=[0, 0],
                          initial_states=nocl.Uniform([-3.5, -3.0, -1.57], [-2.5, 3.0, 1.57]),
-                         parameters=_within(bounds), path_constraints={"obstacle": clear})
+                         parameters=_within(bounds), path_constraints={"obstacle": clear},
+                         penalty_margin=MARGIN)
 
 
 def _sights(ocp: OCP) -> ca.SX:
