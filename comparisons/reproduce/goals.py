@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CLEAR = 0.1  # m between the car's obstacle and its goal, in the problems that are judged
-MARGIN = 0.015  # m that a policy is trained to stay away from the obstacle; with 0.005, 2 of 200 runs touched it by 0.003
+MARGIN = 0.015  # m that a policy is trained to keep from the obstacle; with 0.005, 2 of 200 runs touched it by 0.003
 Bounds = dict[str, tuple[float, float]]
 
 
