@@ -32,8 +32,8 @@ from constrained_problems import PROBLEMS
 
 import nocl
 from nocl.data import Solution
+from nocl.definition.ocp import OCP
 from nocl.judge import simulate
-from nocl.ocp import OCP
 from nocl.solvers.cnd import CND, TrainSettings
 from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.cnd.regression.labels import Problems, policy_controls
@@ -135,8 +135,7 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, default=Path("runs/constrained"))
     args = parser.parse_args()
     warnings.simplefilter("ignore")
-    path = provenance.RESULTS / "constrained_policies.json"
-    rows = json.loads(path.read_text())["rows"] if path.exists() else {}
+    rows = provenance.kept("constrained_policies")
     for name in args.problems:
         rows[name] = judged(name, args.n, args.seed, args.runs) | {"commit": provenance.STARTED}
         print(name, json.dumps(rows[name], indent=1), flush=True)

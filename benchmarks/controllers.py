@@ -35,9 +35,9 @@ from ddp import problem as load_problem
 import nocl
 from nocl.comparisons.reference import SLOTS, resolved
 from nocl.data import Solution
+from nocl.definition.ocp import OCP
 from nocl.judge import Simulation, simulate
 from nocl.nets import FeatureNet
-from nocl.ocp import OCP
 from nocl.solvers.cnd import TrainSettings
 from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.cnd.regression.labels import Problems, policy_controls

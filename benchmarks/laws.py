@@ -25,7 +25,7 @@ import provenance
 from minimum_time import CASES
 
 import nocl
-from nocl.sampling import own_numbers
+from nocl.definition.sampling import own_numbers
 from nocl.solvers.cnd.laws import LawTraining
 from nocl.solvers.cnd.settings import TrainSettings
 
@@ -68,10 +68,10 @@ def main() -> None:
     parser.add_argument("--n", type=int, default=200)
     args = parser.parse_args()
     warnings.simplefilter("ignore")
-    rows: dict[str, Any] = {}
+    rows = provenance.kept("laws")
     for name in args.problems:
         for way in args.ways:
-            rows[f"{name}, {way}"] = measured(name, way, args.effort, args.n)
+            rows[f"{name}, {way}"] = measured(name, way, args.effort, args.n) | {"commit": provenance.STARTED}
             print(name, way, rows[f"{name}, {way}"], flush=True)
             provenance.write("laws", rows)
 

@@ -25,6 +25,15 @@ def write(name: str, rows: Any, **more: Any) -> Path:
     return path
 
 
+def kept(name: str) -> dict[str, Any]:
+    """The rows of benchmarks/results/NAME.json so far, by name, each with the commit that measured it."""
+    path = RESULTS / f"{name}.json"
+    if not path.exists():
+        return {}
+    found = json.loads(path.read_text())
+    return {row: {"commit": found["made"]["commit"], **values} for row, values in found["rows"].items()}
+
+
 def commit() -> str:
     """The commit of the working tree; "+" behind it where Python files differ from it."""
     def git(*words: str) -> str:

@@ -20,8 +20,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 import provenance
 
 import nocl
+from nocl.definition.ocp import OCP
 from nocl.judge import simulate
-from nocl.ocp import OCP
 from nocl.solvers.cnd import TrainSettings
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP

@@ -25,7 +25,7 @@ import provenance
 import nocl
 from nocl.comparisons.comparison import compare
 from nocl.comparisons.studies import FINE, with_reference
-from nocl.sampling import own_numbers
+from nocl.definition.sampling import own_numbers
 from nocl.solvers import DDP
 from nocl.solvers.cnd.settings import TrainSettings
 from nocl.solvers.ddp.global_search import GlobalDDP
@@ -132,11 +132,11 @@ def main() -> None:
     parser.add_argument("--effort", default="normal")
     parser.add_argument("--n", type=int, default=100)
     args = parser.parse_args()
-    rows = {}
+    rows = provenance.kept("references")
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", message=".*extrapolation")
         for kind in args.kinds:
-            rows[kind] = measured(kind, args.effort, args.n)
+            rows[kind] = measured(kind, args.effort, args.n) | {"commit": provenance.STARTED}
             print(kind, rows[kind], flush=True)
             provenance.write("references", rows)
 

@@ -28,8 +28,8 @@ import provenance
 from controllers import optimum
 
 import nocl
+from nocl.definition.ocp import OCP
 from nocl.judge import simulate
-from nocl.ocp import OCP
 from nocl.solvers.cnd import TrainSettings
 from nocl.solvers.cnd.paper import PaperSettings, train_paper
 

@@ -19,7 +19,7 @@ import provenance
 
 import nocl
 from nocl.comparisons.reproduce.goals import CART, POLE, cartpole_problem
-from nocl.sampling import own_numbers
+from nocl.definition.sampling import own_numbers
 from nocl.solvers import DDP, solve_globally
 from nocl.solvers.cnd.settings import TrainSettings
 from nocl.solvers.estimation import Adaptive, ParameterEstimator

@@ -22,9 +22,9 @@ from nocl.comparisons.report.results import (
     REFERENCE,
     Judged,
 )
+from nocl.definition.ocp import OCP
 from nocl.judge.laws import dynamics_function, policy_function
 from nocl.judge.runs import AT_BOUND
-from nocl.ocp import OCP
 from nocl.solvers.nmpc.loop import Loop
 from nocl.support.checks import Array
 from nocl.translate.arguments import Arguments

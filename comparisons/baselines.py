@@ -9,7 +9,7 @@ import numpy as np
 
 from nocl.comparisons.judging import Disturbance, Judging, judge
 from nocl.comparisons.methods import Solving, Starts, runs_of
-from nocl.ocp import OCP
+from nocl.definition.ocp import OCP
 from nocl.solvers.lqr import LQR
 from nocl.support.checks import Array
 

@@ -23,8 +23,8 @@ from nocl.comparisons.methods import MethodRun, Rates, Solving, Starts, Value, c
 from nocl.comparisons.possible import impossible
 from nocl.comparisons.report.report import Report
 from nocl.comparisons.report.results import Judged
-from nocl.constraints import TOLERANCE
-from nocl.ocp import OCP
+from nocl.definition.constraints import TOLERANCE
+from nocl.definition.ocp import OCP
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.support.pool import Pool

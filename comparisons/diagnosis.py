@@ -16,9 +16,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from nocl.data import Solution
+from nocl.definition.ocp import OCP
+from nocl.definition.scales import usual_sizes
+from nocl.definition.substeps import RK4
 from nocl.judge.simulation import simulate
-from nocl.ocp import OCP
-from nocl.scales import usual_sizes
 from nocl.solvers.cnd.settings import TrainSettings
 from nocl.solvers.cnd.training import estimate
 from nocl.solvers.ddp.global_search import solve_globally
@@ -26,7 +27,6 @@ from nocl.solvers.ddp.solver import DDP
 from nocl.solvers.grid import fastest_at_start
 from nocl.solvers.mirrors import mirrors
 from nocl.solvers.nmpc.solver import NMPC
-from nocl.substeps import RK4
 from nocl.support import checks
 from nocl.support.checks import Array
 

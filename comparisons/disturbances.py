@@ -22,15 +22,15 @@ from nocl.comparisons.judging import Disturbance, Judgement, Judging, judge, key
 from nocl.comparisons.methods import MethodRun, Solving, Starts, at_rate, checked, folder_name, how, runs_of
 from nocl.comparisons.reference import SLOTS, Reference, resolved
 from nocl.comparisons.report.findings import Robustness, Scenario, ScenarioLoss
-from nocl.constraints import TOLERANCE
+from nocl.definition.constraints import TOLERANCE
+from nocl.definition.ocp import OCP
+from nocl.definition.system import System
 from nocl.judge.laws import dynamics_function
 from nocl.judge.simulation import simulate
-from nocl.ocp import OCP
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP
 from nocl.support import checks
 from nocl.support.checks import Array
-from nocl.system import System
 from nocl.systems import NAMES
 
 FINE = 320  # intervals of the optimum, a multiple of SLOTS

@@ -13,8 +13,8 @@ import casadi as ca
 import numpy as np
 
 from nocl.data import Solution
+from nocl.definition.ocp import OCP
 from nocl.judge.laws import answer_of, policy_function
-from nocl.ocp import OCP
 from nocl.support import checks
 from nocl.support.checks import Array
 

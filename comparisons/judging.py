@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from nocl.comparisons.each import Laws
 from nocl.comparisons.methods import STAGES, MethodRun, Starts, said, substeps_of
-from nocl.constraints import TOLERANCE
+from nocl.definition.constraints import TOLERANCE
+from nocl.definition.ocp import OCP
 from nocl.judge.runs import Simulation
 from nocl.judge.simulation import simulate
-from nocl.ocp import OCP
 from nocl.solvers.nmpc.loop import Loop
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint

@@ -15,11 +15,11 @@ import numpy as np
 
 from nocl.comparisons.baselines import base_cost
 from nocl.comparisons.methods import Solving, Starts
-from nocl.constraints import TOLERANCE
 from nocl.data import Solution
+from nocl.definition.constraints import TOLERANCE
+from nocl.definition.ocp import OCP
+from nocl.definition.scales import usual_sizes
 from nocl.judge.simulation import simulate
-from nocl.ocp import OCP
-from nocl.scales import usual_sizes
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP
 from nocl.support import checks

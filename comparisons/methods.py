@@ -24,10 +24,10 @@ import numpy as np
 from nocl.comparisons.each import Laws, is_plan
 from nocl.comparisons.report.results import Planned, count
 from nocl.data import Solution
+from nocl.definition.ocp import OCP
+from nocl.definition.sampling import own_numbers
+from nocl.definition.scales import usual_sizes
 from nocl.judge.laws import check_made_for, check_takes_p, policy_function, takes_p
-from nocl.ocp import OCP
-from nocl.sampling import own_numbers
-from nocl.scales import usual_sizes
 from nocl.solvers.nmpc.loop import Loop
 from nocl.support.checks import LARGEST, Array, shown
 

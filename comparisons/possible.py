@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from nocl.comparisons.methods import Solving, Starts
 from nocl.data import Solution
-from nocl.ocp import OCP
+from nocl.definition import measured
+from nocl.definition.ocp import OCP
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
@@ -46,11 +47,11 @@ def impossible(ocp: OCP, starts: Starts, solved: NDArray[np.bool_], controls: Se
 def _outside(ocp: OCP, starts: Starts, tolerance: float) -> list[str]:
     """What an initial state violates by itself."""
     u, t = np.zeros((len(starts), 0, ocp.system.nu)), np.zeros(1)
-    shares = ocp.shares(ocp.least_held(starts.x[:, None], u, t, starts.p))
+    shares = measured.shares(ocp, measured.least_held(ocp, starts.x[:, None], u, t, starts.p))
     said = []
     for row in shares:
         i = int(row.argmax()) if row.size else -1
-        name, much = ocp.excess(i, float(row[i])) if row.size else ("", "")
+        name, much = measured.excess(ocp, i, float(row[i])) if row.size else ("", "")
         said.append(f"the initial state itself violates {name!r} by {much}" if row.size and row[i] > tolerance else "")
     return said
 
@@ -80,7 +81,8 @@ def _worst(ocp: OCP, plan: Solution) -> Array:
     (B, nodes, nx), m = plan.x.shape, len(ocp.functions.rows)
     x, p = plan.x.reshape(-1, 1, nx), np.repeat(plan.parameters, nodes, axis=0)
     u = np.concatenate([plan.u, plan.u[:, -1:]], axis=1).reshape(B * nodes, 1, -1)
-    shares = ocp.shares(ocp.least_held(x, u, plan.t.reshape(-1, 1), p), ocp.least_at_end(x[:, 0], p))
+    least = measured.least_held(ocp, x, u, plan.t.reshape(-1, 1), p)
+    shares = measured.shares(ocp, least, measured.least_at_end(ocp, x[:, 0], p))
     shares = shares.reshape(B, nodes, -1)
     shares[:, :-1, m:] = -np.inf  # what holds at the end alone
     shares[:, -1, :m][:, ocp.functions.rows.of_u] = -np.inf  # no control acts there
@@ -94,5 +96,5 @@ def _told(ocp: OCP, shares: Array, tolerance: float) -> str:
     node, row = np.unravel_index(int(nearest.argmax()), nearest.shape)
     if not tolerance < nearest.max() < np.inf:
         return ""
-    name, much = ocp.excess(int(row), float(nearest.max()))
+    name, much = measured.excess(ocp, int(row), float(nearest.max()))
     return f"no plan holds {name!r} from here: worst at node {node} of {len(nearest) - 1} by {much}"

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import zip_longest
 
 import numpy as np
 
 from nocl.comparisons.report import results
 from nocl.data import Solution
-from nocl.ocp import OCP
+from nocl.definition.constraints import TOLERANCE
+from nocl.definition.ocp import OCP
 from nocl.solvers.ddp.bank import better
 from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
 
 NAME = results.REFERENCE
+INSIDE = 0.99  # of the tolerance, that plans end within: at its edge rounding decides
 SLOTS = 40  # kicks fall on multiples of the horizon over SLOTS
 
 
@@ -28,21 +31,35 @@ class Reference:
     ----------
     guesses : sequence of controls [B, K, nu]
         Held on K equal intervals; NaN stands for u*.
+    ends : sequence of [B], where the horizon is free
+        When each guess ends.
+    tolerance : share of terminal constraints' scales
+        Where the horizon is free, feedback ends as soon as all ends hold within it: so does the reference.
     """
 
-    def __init__(self, ocp: OCP, intervals: int, guesses: Sequence[Array] = ()) -> None:
-        ocp.refuse_free("Reference")
-        self.ocp, self.intervals, self.guesses = ocp, intervals, list(guesses)
+    def __init__(self, ocp: OCP, intervals: int, guesses: Sequence[Array] = (), ends: Sequence[Array] = (),
+                 tolerance: float = TOLERANCE) -> None:
+        self.ocp = ocp.loosened(INSIDE * tolerance) if ocp.is_free else ocp
+        self.intervals, self.guesses, self.ends = intervals, list(guesses), list(ends)
 
     def solve(self, x0: Array, p: Array | None = None) -> Solution:
         """The best solution of each state x0 [B, nx], p [B, np]; guesses are of the same."""
         ddp = DDP(self.ocp, intervals=self.intervals, between=True)
         best = ddp.solve(x0, p=p)
         goal = self.ocp.goals(np.zeros((len(x0), 0)) if p is None else p)[1][:, None]
-        for guess in self.guesses:
+        for guess, T in zip_longest(self.guesses, self.ends):
             u = guess[:, np.arange(self.intervals) * guess.shape[1] // self.intervals]
-            best = better(best, ddp.solve(x0, u=np.ascontiguousarray(np.where(np.isfinite(u), u, goal)), p=p))
+            u = np.ascontiguousarray(np.where(np.isfinite(u), u, goal))
+            best = better(best, ddp.solve(x0, u=u, t=self._nodes(T), p=p))
         return best
+
+    def _nodes(self, T: Array | None) -> Array | None:
+        """The nodes [B, intervals + 1] of guesses that end then, where the horizon is free."""
+        if T is None:
+            return None
+        low, high = self.ocp.horizon.low, self.ocp.horizon.high
+        last = np.clip(np.where(np.isfinite(T), T, np.sqrt(low * high)), low, high)
+        return last[:, None] * np.linspace(0, 1, self.intervals + 1)
 
 
 def resolved(ocp: OCP, start: Solution, kicks: Sequence[tuple[int, Array]]) -> Array:

@@ -10,11 +10,11 @@ import numpy as np
 from nocl.comparisons.promise import interval
 from nocl.comparisons.reference import Reference
 from nocl.comparisons.report.findings import Region, per_cent
-from nocl.constraints import TOLERANCE
+from nocl.definition.constraints import TOLERANCE
+from nocl.definition.ocp import OCP
+from nocl.definition.sampling import Distribution, Gaussian, Uniform, own_numbers
+from nocl.definition.scales import usual_sizes
 from nocl.judge.simulation import simulate
-from nocl.ocp import OCP
-from nocl.sampling import Distribution, Gaussian, Uniform, own_numbers
-from nocl.scales import usual_sizes
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array

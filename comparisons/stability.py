@@ -24,9 +24,9 @@ from nocl.comparisons.report.results import (
     REFERENCE,
 )
 from nocl.data import Solution
+from nocl.definition.ocp import OCP
+from nocl.definition.scales import usual_sizes
 from nocl.judge.laws import policy_function
-from nocl.ocp import OCP
-from nocl.scales import usual_sizes
 from nocl.solvers.ddp.solver import DDP
 from nocl.solvers.lqr import LQR
 from nocl.support.checks import Array

@@ -20,9 +20,9 @@ from nocl.comparisons.reference import NAME, Reference
 from nocl.comparisons.region import region
 from nocl.comparisons.report.report import Report
 from nocl.comparisons.stability import stability
-from nocl.constraints import TOLERANCE
+from nocl.definition.constraints import TOLERANCE
+from nocl.definition.ocp import OCP
 from nocl.judge.laws import policy_function
-from nocl.ocp import OCP
 from nocl.support import checks
 
 FINE = 320  # intervals of the reference
@@ -45,17 +45,20 @@ def study(ocp: OCP, methods: Mapping[str, Any], n: int = 200, x0: ArrayLike | No
     variants, disturbances : of robustness
 
     The reference is DDP's on FINE intervals, from what each method found; it holds the constraints, and is judged like
-    the others. With `out`
+    the others. Where the horizon is free there are no audits, stability and disturbances. With `out`
     solves and judged runs are kept; the reference, audits, optima under disturbances and regions are found anew.
     """
     checks.problem(ocp, "study")
-    ocp.refuse_free("study")
+    if robust:
+        ocp.refuse_free("study(robust=True)")
     folder = None if out is None else Path(out)
     report = compare(ocp, methods, n, x0, seed, hold, workers, None if folder is None else folder / "compare", progress,
                      p, tolerance)
     report = with_reference(report, FINE, workers, progress)
-    report = replace(report, audits=audit(report, methods, model), promises=promises(report),
-                     stability=stability(report, methods))
+    report = replace(report, promises=promises(report))
+    if ocp.is_free:
+        return report
+    report = replace(report, audits=audit(report, methods, model), stability=stability(report, methods))
     if not robust:
         return report
     found = robustness(ocp, with_loops(methods), report.x0[:ROBUST], variants, disturbances, workers,
@@ -69,9 +72,11 @@ def study(ocp: OCP, methods: Mapping[str, Any], n: int = 200, x0: ArrayLike | No
 def with_reference(report: Report, intervals: int, workers: int | str = 1, progress: bool | None = None) -> Report:
     """The report with the reference as its last method, from the controls of all that are there."""
     guesses = [j.simulation.u[:, :-1] for j in report.judged]
+    ends = [j.simulation.times[:, -1] for j in report.judged] if report.ocp.is_free else []
+    tolerance = report.settings.get("tolerance", TOLERANCE)
+    reference = Reference(report.ocp, intervals, guesses, ends, tolerance)
     start, states = time.perf_counter(), Starts(report.x0, report.parameters)
-    found = judged_runs(report.ocp, {NAME: Reference(report.ocp, intervals, guesses)}, states, (None,),
-                        Solving(workers, None, progress), report.settings.get("tolerance", TOLERANCE))
+    found = judged_runs(report.ocp, {NAME: reference}, states, (None,), Solving(workers, None, progress), tolerance)
     seconds = report.seconds + time.perf_counter() - start
     return replace(report, judged=(*report.judged, *found), seconds=seconds)
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from nocl.constraints import Free, limit_rates
-from nocl.ocp import OCP
-from nocl.parameters import parameter, spline, time
-from nocl.sampling import Gaussian, Uniform
-from nocl.smoothness import smooth_abs, smooth_max, split_controls
+from nocl.definition.constraints import Free, limit_rates
+from nocl.definition.ocp import OCP
+from nocl.definition.parameters import parameter, spline, time
+from nocl.definition.sampling import Gaussian, Uniform
+from nocl.definition.smoothness import smooth_abs, smooth_max, split_controls
+from nocl.definition.system import System
 from nocl.support.lazy import hand_on
-from nocl.system import System
 
 if TYPE_CHECKING:
     from nocl.data import Dataset, Solution, Trajectory

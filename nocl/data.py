@@ -9,10 +9,10 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from nocl.sampling import Seed
+from nocl.definition.sampling import Seed
+from nocl.definition.system import System
 from nocl.support import checks
 from nocl.support.checks import Array
-from nocl.system import System
 
 SAME = 1e-3  # costs closer than this, relative, count as the same optimum
 TINY = 1e-10  # ... and of the usual cost: below that, costs are equal

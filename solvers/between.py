@@ -14,9 +14,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from nocl.constraints import TOLERANCE
-from nocl.functions import Functions
-from nocl.substeps import RK4
+from nocl.definition.constraints import TOLERANCE
+from nocl.definition.functions import Functions
+from nocl.definition.substeps import RK4
 from nocl.support.checks import Array
 
 INSIDE = 8  # parts of an interval, at whose ends rows are looked at

@@ -16,7 +16,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nocl.ocp import OCP
+from nocl.definition.ocp import OCP
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.translate.arguments import Arguments

@@ -15,11 +15,11 @@ from dataclasses import replace
 import numpy as np
 
 from nocl.data import Solution
-from nocl.functions import Functions
-from nocl.ocp import OCP
-from nocl.sampling import own_numbers
-from nocl.scales import usual_sizes
-from nocl.substeps import FEW, FINEST, RADAU, REMEDY, RK4, STABLE, TRIED, Grid, grid_of
+from nocl.definition.functions import Functions
+from nocl.definition.ocp import OCP
+from nocl.definition.sampling import own_numbers
+from nocl.definition.scales import usual_sizes
+from nocl.definition.substeps import FEW, FINEST, RADAU, REMEDY, RK4, STABLE, TRIED, Grid, grid_of
 from nocl.support.checks import Array
 
 ROWS = 4  # solutions that are looked at

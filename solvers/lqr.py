@@ -20,8 +20,8 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import BSpline, make_interp_spline
 from scipy.linalg import LinAlgError, solve_continuous_are
 
-from nocl.ocp import OCP
-from nocl.scales import units
+from nocl.definition.ocp import OCP
+from nocl.definition.scales import units
 from nocl.support import checks
 from nocl.support.checks import Array
 

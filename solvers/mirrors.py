@@ -10,8 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from nocl.definition.goals import beside
+from nocl.definition.ocp import OCP
 from nocl.judge.laws import dynamics_function
-from nocl.ocp import OCP, beside
 from nocl.support.checks import Array
 
 Mirror = tuple[Array, Array]  # signs of x - x* [nx] and of u - u* [nu]

@@ -9,9 +9,9 @@
 
 Onken, Nurbekyan, Li, Wu Fung, Osher, Ruthotto, "A Neural Network Approach for High-Dimensional Optimal Control",
 arXiv 2104.03270; settings: their published code. As everywhere in nocl V_t + min_u (L + V_x'f) = 0 and V(x, T) = G(x).
-Departures: u comes from the problem's own symbols (`nocl.hamiltonian`), with the box U; the weight of G is the
-problem's; and `scale`, half the mean curvature of L in u, is theirs only where L = ||u||^2 + ..., as in their problems:
-with it a fresh network's controls are of order one whatever the units of the cost.
+Departures: u comes from the problem's own symbols (`nocl.definition.hamiltonian`), with the box U; the weight of G is
+the problem's; and `scale`, half the mean curvature of L in u, is theirs only where L = ||u||^2 + ..., as in their
+problems: with it a fresh network's controls are of order one whatever the units of the cost.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor, nn
 
-from nocl.hamiltonian import minimiser
-from nocl.ocp import OCP
+from nocl.definition.hamiltonian import minimiser
+from nocl.definition.ocp import OCP
 from nocl.support import checks, store
 from nocl.support.checks import Array
 from nocl.support.fields import Checked, coefficients, count, flag, positive

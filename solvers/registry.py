@@ -11,7 +11,7 @@ from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
-from nocl.ocp import OCP
+from nocl.definition.ocp import OCP
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from numpy.typing import ArrayLike
 from tqdm import tqdm
 
 from nocl.data import Solution
-from nocl.ocp import OCP
+from nocl.definition.ocp import OCP
 from nocl.support import checks
 from nocl.support.checks import Array
 

@@ -23,9 +23,10 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from nocl.data import TINY, Solution, hits
-from nocl.ocp import OCP
-from nocl.sampling import box
-from nocl.scales import usual_sizes
+from nocl.definition import measured
+from nocl.definition.ocp import OCP
+from nocl.definition.sampling import box
+from nocl.definition.scales import usual_sizes
 from nocl.solvers.mirrors import Mirror, mirrored
 from nocl.support.checks import Array
 
@@ -247,7 +248,7 @@ class Search:
     def solution(self) -> Solution:
         """The best of each state; seconds, iterations and `tried` are of all starts."""
         best = self.best
-        clearance = self.ocp.clearance(best.x, best.u, best.t, self.p)
+        clearance = measured.clearance(self.ocp, best.x, best.u, best.t, self.p)
         return replace(best, clearance=clearance, seconds=self.seconds, iterations=self.iterations,
                        tried=self._tried(), unit=np.full(len(self.x0), self.unit))
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from nocl.constraints import Free
-from nocl.ocp import OCP
-from nocl.sampling import Seed
+from nocl.definition.constraints import Free
+from nocl.definition.ocp import OCP
+from nocl.definition.sampling import Seed
+from nocl.definition.system import System
 from nocl.support.checks import Array
-from nocl.system import System
 
 WAVES = 8  # half waves in a random control, the slow ones the largest
 QUIETEST = 0.003  # its smallest amplitude, in half widths of U

@@ -17,7 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from nocl.ocp import OCP
+from nocl.definition.ocp import OCP
 from nocl.support import checks
 from nocl.support.lazy import hand_on
 

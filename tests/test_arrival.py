@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import base64
+
 import casadi as ca
 import numpy as np
 import pytest
 
 import nocl
-from nocl.comparisons import compare
+from nocl.comparisons import compare, study
+from nocl.comparisons.report.payload import payload
 from nocl.solvers import DDP
 
 p, v, u = (ca.SX.sym(name) for name in "pvu")
@@ -58,12 +61,48 @@ def test_a_run_that_only_passes_through_is_seen(speed):
 
 def test_time_optimal_feedback_takes_the_analytic_time():
     x0 = STATES.sample(4, 1)
-    switching = X[0] + X[1] * ca.fabs(X[1]) / 2
     ocp = problem(scales={"at p": 1.0, "at v": 1.0})
-    run = nocl.simulate(ocp, law(-ca.tanh(switching / 1e-4)), x0, tolerance=1e-2)
+    run = nocl.simulate(ocp, switching(), x0, tolerance=1e-2)
     assert run.success.all()
     left = np.abs(run.x[:, -1, 1])  # on the switching curve, what is left takes as long as the speed says
     np.testing.assert_allclose(run.cost + left, least_time(x0), rtol=2e-3)
+
+
+def switching():
+    return law(-ca.tanh((X[0] + X[1] * ca.fabs(X[1]) / 2) / 1e-4))
+
+
+@pytest.fixture(scope="module")
+def studied():
+    """The switching law and DDP's plans beside the reference."""
+    ocp = problem(scales={"at p": 1.0, "at v": 1.0})
+    return study(ocp, {"switching": switching(), "DDP": DDP(ocp)}, n=4, seed=5, tolerance=1e-2, progress=False)
+
+
+def test_the_reference_ends_as_near_as_feedback_does(studied):
+    """Not later than the least time to the goal itself, and by no more sooner than the goal is away from where it may
+    end."""
+    best, least = studied.judged[-1].simulation, least_time(studied.x0)
+    assert [j.name for j in studied.judged] == ["switching", "DDP", "reference"]
+    assert best.success.all()
+    assert (best.cost < least).all()
+    corner = least_time(np.array([[0.01, 0.01]]))
+    assert (best.cost > least - corner).all()
+    assert (studied.gap[-1] <= 0.02).all()  # per cent: held controls against a law in continuous time
+    assert len(studied.promises) == 4  # two methods, within 2 % and on constraints
+
+
+def test_the_page_has_each_run_on_its_own_times(studied, tmp_path):
+    data = payload(studied)
+    at, runs = data["channels"]["time"], data["methods"][0]
+    limits = np.frombuffer(base64.b64decode(runs["limits"]), "<f4").reshape(4, -1, 2)
+    ends = np.array([j.simulation.t[:, -1] for j in studied.judged])
+    np.testing.assert_allclose(limits[:, at], np.stack([0 * ends[0], ends[0]], axis=1), rtol=1e-6)
+    assert runs["t"] is None
+    assert data["horizon"] == ends.max()
+    page = studied.save(tmp_path / "page", animation=True)
+    assert page.exists()
+    assert (tmp_path / "page" / "animation.gif").exists()
 
 
 def test_plans_end_on_time():
@@ -139,8 +178,7 @@ def test_what_makes_no_sense_is_refused():
 
 def test_methods_are_compared_on_a_free_horizon():
     ocp = problem(scales={"at p": 1.0, "at v": 1.0})
-    feedback = law(-ca.tanh((X[0] + X[1] * ca.fabs(X[1]) / 2) / 1e-4))
-    methods = {"law": feedback, "DDP": DDP(ocp), "never": ALWAYS}
+    methods = {"law": switching(), "DDP": DDP(ocp), "never": ALWAYS}
     report = compare(ocp, methods, n=3, seed=2, tolerance=1e-2)
     own, plan, never = report.judged
     assert own.simulation.success.all()
@@ -151,8 +189,6 @@ def test_methods_are_compared_on_a_free_horizon():
     assert (own.simulation.cost < plan.simulation.cost).all()  # it ends within the tolerance
     assert plan.simulation.t.shape == (3, 81)
     assert "Feedback ends as soon as" in str(report)
-    with pytest.raises(ValueError, match="takes a number as horizon"):
-        report.save("nowhere")
 
 
 def test_a_comparison_is_resumed_with_each_horizon(tmp_path):

@@ -9,9 +9,9 @@ import torch
 from constrained import point
 
 import nocl
-from nocl.constraints import TOLERANCE
+from nocl.definition.constraints import TOLERANCE
+from nocl.definition.ocp import OCP
 from nocl.nets import MLP, FeatureNet
-from nocl.ocp import OCP
 from nocl.solvers.cnd import CND, TrainSettings
 from nocl.solvers.cnd.held import FIRST, LARGEST, LOST, Held
 from nocl.solvers.cnd.regression.in_torch import InTorch

@@ -12,7 +12,7 @@ from constrained import PROBLEMS, TIGHT, Problem, Shooting, kkt_residual, rk4_st
 
 import nocl
 from nocl.data import Solution
-from nocl.scales import usual_sizes
+from nocl.definition.scales import usual_sizes
 from nocl.solvers import NMPC, solve_globally
 from nocl.solvers.ddp import augmented
 from nocl.solvers.ddp.bank import better

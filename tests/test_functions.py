@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import nocl
-from nocl.hamiltonian import hamiltonian, minimiser
+from nocl.definition.hamiltonian import hamiltonian, minimiser
 from nocl.solvers.ddp.kernel import ddp_source
 from nocl.solvers.nmpc.sensitivity import Derivatives
 from nocl.solvers.nmpc.transcription import Transcription
@@ -17,9 +17,9 @@ from nocl.translate.arguments import Arguments
 
 ROOT = Path(__file__).resolve().parents[1]
 DOOR = {  # files that may hold the symbols of a system and the expressions of a problem themselves
-    "nocl/system.py",  # where f is written
-    "nocl/ocp.py",  # where L, G and h are
-    "nocl/functions.py",  # the door
+    "nocl/definition/system.py",  # where f is written
+    "nocl/definition/ocp.py",  # where L, G and h are
+    "nocl/definition/functions.py",  # the door
     "solvers/cnd/lifted.py",  # where a problem is written anew, p and t among its states
     "solvers/ddp/free.py",  # and where its horizon is one of them
     "solvers/ddp/smoothing.py",  # and where controls that H is linear in have a quadratic term
@@ -240,7 +240,7 @@ FILES = [p.relative_to(ROOT).as_posix() for folder in ("nocl", "solvers", "compa
 @pytest.mark.parametrize("path", [p for p in FILES if p not in DOOR])
 def test_nobody_goes_round_the_door(path):
     found = round_the_door((ROOT / path).read_text(), not path.startswith("nocl/"))
-    assert not found, f"{path} reads {found}: ask ocp.functions, its stage, node, end or feedback (nocl/functions.py)"
+    assert not found, f"{path} reads {found}: ask ocp.functions, its stage, node, end or feedback"
 
 
 @pytest.mark.parametrize("source", [

@@ -19,6 +19,7 @@ from odd import Call, fault, strange
 
 import nocl
 from nocl.comparisons import compare
+from nocl.definition import measured
 from nocl.nets import MLP, FeatureNet
 from nocl.solvers import DDP, LQR, NMPC
 from nocl.solvers.cnd import TrainSettings
@@ -201,8 +202,8 @@ def problems() -> list[Call]:
         Call("System.difference", s.difference, {"other": system(), "equations": True}),
         Call("System.under", s.under, {"f": s.f.wrap()}),
         Call("OCP.from_goal", o.from_goal, {"x": [[0.1, 0.2]]}, lambda d: d.shape[-1] == 2 or d.shape == (2, 1)),
-        Call("OCP.least", ocp_of().least, {"x": np.zeros((2, 3, 2))}, lambda v: v.shape == (2, 1)),
-        Call("OCP.violation", ocp_of().violation, {"least": np.zeros((2, 1))},
+        Call("least", partial(measured.least, ocp_of()), {"x": np.zeros((2, 3, 2))}, lambda v: v.shape == (2, 1)),
+        Call("violation", partial(measured.violation, ocp_of()), {"least": np.zeros((2, 1))},
              lambda v: v.ndim == 1 and not np.isnan(v).any()),
         Call("simulate", partial(nocl.simulate, o), {"controller": LQR(o), "x0": [0.1, 0.0], "f": s.f, "hold": 3,
              "nodes": 5, "kicks": [(0.5, [0.0, 0.1])], "delay": 0.0, "t0": 0.0, "rtol": 1e-6, "atol": 1e-6}, judged,

@@ -9,13 +9,13 @@ import pytest
 import torch
 
 import nocl
+from nocl.definition.substeps import COARSE, FINE, TRIED, WANTED
 from nocl.solvers import DDP, NMPC
 from nocl.solvers.ddp.solver import substeps_for
 from nocl.solvers.ddp.without_compiler import NumpyKernel
 from nocl.solvers.grid import measured
 from nocl.solvers.nmpc.solver import shared_program
 from nocl.solvers.nmpc.tasks import attempt
-from nocl.substeps import COARSE, FINE, TRIED, WANTED
 from nocl.sysid.settings import LogSettings
 from nocl.systems import NAMES
 

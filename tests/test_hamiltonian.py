@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import nocl
-from nocl.hamiltonian import hamiltonian, minimiser
+from nocl.definition.hamiltonian import hamiltonian, minimiser
 
 
 def problem(couple: str) -> nocl.OCP:

@@ -13,10 +13,10 @@ import torch
 from scipy.integrate import solve_ivp
 
 import nocl
-from nocl import parameters
+from nocl.definition import parameters
+from nocl.definition.sampling import own_numbers
+from nocl.definition.scales import usual_sizes
 from nocl.nets import MLP, FeatureNet
-from nocl.sampling import own_numbers
-from nocl.scales import usual_sizes
 from nocl.solvers import DDP, LQR, NMPC
 from nocl.solvers.ddp.bank import SolutionBank, extend
 from nocl.solvers.ddp.global_search import solve_globally

@@ -11,12 +11,12 @@ import stiff
 from lq import Array
 
 import nocl
+from nocl.definition.substeps import RADAU, RK4, Grid, Steps, settled
 from nocl.solvers import DDP, NMPC
 from nocl.solvers.ddp.solver import steps_for
 from nocl.solvers.ddp.without_compiler import NumpyKernel
 from nocl.solvers.grid import measured
 from nocl.solvers.nmpc.solver import shared_program
-from nocl.substeps import RADAU, RK4, Grid, Steps, settled
 from nocl.translate import radau
 
 

@@ -5,7 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from nocl import Gaussian, Uniform, sampling
+from nocl import Gaussian, Uniform
+from nocl.definition import sampling
 
 N = 200_000
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import nocl
-from nocl.smoothness import _switches, kinks, linear_controls, rounded
+from nocl.definition.smoothness import _switches, kinks, linear_controls, rounded
 from nocl.solvers import DDP, NMPC
 from nocl.solvers.ddp.solver import DDPSettings
 

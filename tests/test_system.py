@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import nocl
-from nocl import pretty
+from nocl.definition import pretty
 from nocl.systems import NAMES
 
 

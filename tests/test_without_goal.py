@@ -10,7 +10,7 @@ import pytest
 import nocl
 from nocl.comparisons import compare
 from nocl.comparisons.diagnosis import doctor
-from nocl.ocp import OCP
+from nocl.definition.ocp import OCP
 from nocl.solvers import DDP, LQR, NMPC
 from nocl.solvers.cnd.settings import TrainSettings
 from nocl.solvers.ddp.global_search import GlobalDDP, solve_globally

@@ -41,7 +41,7 @@ def animate(report: Results, state: int | None = None, methods: Sequence[str] | 
     i = _state(report, state, chosen)
     with matplotlib.rc_context({**STYLE, "axes.grid": False}):
         figure, frame = _set_up(report, i, chosen, draw or drawing(report.ocp))
-        images = _images(figure, frame, np.linspace(0.0, report.ocp.horizon, max(2, round(seconds * RATE))))
+        images = _images(figure, frame, np.linspace(0.0, _until(report, i, chosen), max(2, round(seconds * RATE))))
     return _gif(images)
 
 
@@ -91,24 +91,30 @@ def _set_up(report: Results, i: int, chosen: Sequence[int], draw: Draw) -> tuple
                                hspace=0.28, wspace=0.22)
     visited = np.concatenate([report.judged[m].simulation.x[i] for m in chosen])
     limits = _limits(np.concatenate([report.judged[m].simulation.u[i] for m in chosen]))
+    until = _until(report, i, chosen)
     clock = figure.text(0.5, 0.955, "", ha="center", fontsize=10)
     parts = []
     for column, m in enumerate(chosen):
         ax = figure.add_subplot(grid[0, column], projection="3d" if is_spatial(draw) else None)
         ax.set_title(plain(f"{report.judged[m].name}: cost {number(report.cost[m, i])}"), fontsize=9,
                      color=COLOURS[m % len(COLOURS)])
-        parts.append((m, draw(ax, ocp, visited), _controls(figure.add_subplot(grid[1, column]), ocp, limits)))
+        parts.append((m, draw(ax, ocp, visited), _controls(figure.add_subplot(grid[1, column]), ocp, limits, until)))
 
     def frame(t: float) -> list[Any]:
         clock.set_text(plain(f"{ocp.system.name}, initial state {i}, t = {t:.2f}"))
         artists = [clock]
         for m, move, plot in parts:
             s, held = report.judged[m].simulation, report.judged[m].held
-            x, u = so_far(s.t, s.x[i], t), so_far(s.t, s.u[i], t, held)
-            artists += [*move(x, u[-1], t), *plot(s.t, u, t, held)]
+            x, u = so_far(s.times[i], s.x[i], t), so_far(s.times[i], s.u[i], t, held)
+            artists += [*move(x, u[-1], t), *plot(s.times[i], u, t, held)]
         return artists
 
     return figure, frame
+
+
+def _until(report: Results, i: int, chosen: Sequence[int]) -> float:
+    """When the last of the runs from a state ends."""
+    return max(float(report.judged[m].simulation.times[i, -1]) for m in chosen)
 
 
 def so_far(t: Array, values: Array, now: float, held: bool = False) -> Array:
@@ -124,10 +130,11 @@ def _limits(u: Array) -> tuple[float, float]:
     return low - room, high + room
 
 
-def _controls(ax: Any, ocp: Any, limits: tuple[float, float]) -> Callable[[Array, Array, float, bool], list[Any]]:
+def _controls(ax: Any, ocp: Any, limits: tuple[float, float],
+              until: float) -> Callable[[Array, Array, float, bool], list[Any]]:
     """The controls against time, as far as they have come."""
     s = ocp.system
-    ax.set(xlim=(0, ocp.horizon), ylim=limits)
+    ax.set(xlim=(0, until), ylim=limits)
     ax.set_xlabel("t", labelpad=1)
     ax.set_ylabel(plain(s.unit(s.control_names[0])) if s.nu == 1 else "u", labelpad=1)
     ax.tick_params(labelsize=7)
@@ -137,7 +144,7 @@ def _controls(ax: Any, ocp: Any, limits: tuple[float, float]) -> Callable[[Array
         ax.legend(fontsize=6, loc="upper right", ncols=s.nu, borderpad=0.1, handlelength=1)
 
     def plot(t: Array, u: Array, now: float, held: bool) -> list[Any]:
-        times = np.r_[t[: len(u) - 1], now]
+        times = np.r_[t[: len(u) - 1], min(now, t[-1])]
         for k, line in enumerate(lines):
             line.set_drawstyle("steps-post" if held else "default")
             line.set_data(times, u[:, k])

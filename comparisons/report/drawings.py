@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from matplotlib.patches import Polygon, Rectangle
 
-from nocl.ocp import OCP
+from nocl.definition.ocp import OCP
 from nocl.support.checks import Array
 
 Frame = Callable[[Array, Array, float], Sequence[Any]]
@@ -210,7 +210,7 @@ def phase(ax: Any, ocp: OCP, visited: Array) -> Frame:
 def _against_time(ax: Any, ocp: OCP, visited: Array) -> Frame:
     low, high = min(visited.min(), ocp.x_goal[0]), max(visited.max(), ocp.x_goal[0])
     room = 0.08 * (high - low or 1.0)
-    ax.set(xlim=(0, ocp.horizon), ylim=(low - room, high + room))
+    ax.set(xlim=(0, ocp.longest), ylim=(low - room, high + room))
     ax.set_xlabel("t")
     ax.set_ylabel(ocp.system.unit(ocp.system.state_names[0]).replace("$", r"\$"))
     if ocp.has_goal:

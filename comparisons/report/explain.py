@@ -117,13 +117,17 @@ def _neighbours(report: Results, ways: _Ways, m: int, i: int) -> Iterator[str]:
 
 
 class _Ways:
-    """How far apart runs are: at the worst time, in the worst coordinate, in standard deviations over all runs."""
+    """How far apart runs are: at the worst time, in the worst coordinate, in standard deviations over all runs.
+
+    At the same time; where the horizon is free, at the same share of each run.
+    """
 
     def __init__(self, report: Results) -> None:
         self.report = report
-        self.t = np.linspace(0.0, report.ocp.horizon, NODES)
         runs = [j.simulation for j in report.judged]
-        x = [s.x[:, np.rint(np.linspace(0, len(s.t) - 1, NODES)).astype(int)] for s in runs]
+        nodes = [np.rint(np.linspace(0, s.x.shape[1] - 1, NODES)).astype(int) for s in runs]
+        self.t = [s.times[:, index] for s, index in zip(runs, nodes, strict=True)]  # [methods] of [B, NODES]
+        x = [s.x[:, index] for s, index in zip(runs, nodes, strict=True)]
         values = np.concatenate([part.reshape(-1, part.shape[-1]) for part in x])
         known = values[np.isfinite(values).all(axis=1)]
         sd = known.std(axis=0) if len(known) else np.ones(values.shape[1])
@@ -154,8 +158,8 @@ class _Ways:
         system = self.report.ocp.system
         name = system.state_names[k]
         unit = system.units.get(name, "")
-        gap = float((self.z[m][i] - self.z[b][i])[node, k] * self.sd[k])
-        where = f"farthest apart in {name} at t = {self.t[node]:.3g}, by {number(gap)}{' ' + unit if unit else ''}"
+        gap, t = float((self.z[m][i] - self.z[b][i])[node, k] * self.sd[k]), self.t[m][i, node]
+        where = f"farthest apart in {name} at t = {t:.3g}, by {number(gap)}{' ' + unit if unit else ''}"
         way = "another way than the best run" if self.another(m, b, i) else "the best known way"
         return f"It goes {way} ({where})."
 

@@ -100,7 +100,7 @@ def trajectories(report: Results, states: Sequence[int]) -> Figure:
         for m, judged in enumerate(report.judged):
             run = np.hstack([judged.simulation.x[i], judged.simulation.u[i], beside[m][i]])
             steps = range(s.nx, s.nx + s.nu) if judged.held else range(0)
-            _draw_run(axes[:, c], judged.simulation.t, run, m, judged.name, steps)
+            _draw_run(axes[:, c], judged.simulation.times[i], run, m, judged.name, steps)
         goals = np.concatenate(report.ocp.goals(report.parameters[[i]]), axis=1)[0]
         for ax, goal in zip(axes[:, c] if report.ocp.has_goal else [], goals, strict=False):  # constraints have none
             ax.axhline(goal, color="0.6", linewidth=0.7, zorder=0)

@@ -10,9 +10,9 @@ from typing import NamedTuple
 import casadi as ca
 import numpy as np
 
-from nocl.constraints import END, Constraint
+from nocl.definition.constraints import END, Constraint
+from nocl.definition.ocp import OCP
 from nocl.judge.runs import Simulation
-from nocl.ocp import OCP
 from nocl.support.checks import Array
 
 
@@ -47,7 +47,7 @@ def values(ocp: OCP, s: Simulation, p: Array) -> Array:
         return np.zeros((B, nodes, 0))
     at = ocp.functions.arguments
     function = at.function("values", {"e": ca.vertcat(*(one.expression for one in drawn))})
-    given = at.columns(x=s.x.reshape(B * nodes, -1), u=s.u.reshape(B * nodes, -1), t=np.tile(s.t, B),
+    given = at.columns(x=s.x.reshape(B * nodes, -1), u=s.u.reshape(B * nodes, -1), t=s.times.ravel(),
                        p=np.repeat(p, nodes, axis=0))
     return np.asarray(function(*given).full().T.reshape(B, nodes, -1))
 

@@ -21,7 +21,7 @@ from nocl.comparisons.report.explain import explained_method
 from nocl.comparisons.report.findings import MethodAudit, Rollouts
 from nocl.comparisons.report.results import Judged, Results
 from nocl.comparisons.report.tables import AUDITED, failure
-from nocl.ocp import OCP
+from nocl.definition.ocp import OCP
 from nocl.support.checks import Array
 
 NODES = {81: 1_500_000, 41: 2_500_000, 21: 3_700_000}  # times of a run, and the characters that all runs may take then
@@ -45,7 +45,7 @@ def payload(report: Results) -> dict[str, Any]:
     s, kept = report.ocp.system, kept_states(report)
     nodes, states = kept
     return {"name": s.name, "states": s.state_names, "controls": s.control_names,
-            "labels": [s.unit(name) for name in s.names], "horizon": report.ocp.horizon,
+            "labels": [s.unit(name) for name in s.names], "horizon": report.last,
             "goal": _goal(report), **_parameters(report),
             "lbu": s.lbu.tolist(), "ubu": s.ubu.tolist(), "explained": explained_method(report),
             "numbers": list(NUMBERS),
@@ -96,16 +96,16 @@ def kept_states(report: Results) -> tuple[int, NDArray[np.integer[Any]]]:
 
 
 def channels(report: Results) -> dict[str, int]:
-    """Where in a run stands what follows its states and controls: the cost to go, V where a method has one, and the
-    values of constraints, by name.
+    """Where in a run stands what follows its states and controls: the cost to go, V where a method has one, the values
+    of constraints, by name, and the time where each run has its own.
     """
     names = ["togo", *(["V"] if valued(report) is not None else []),
-             *(f"held {one.name}" for one in limits.others(report.ocp))]
+             *(f"held {one.name}" for one in limits.others(report.ocp)), *(["time"] if report.ocp.is_free else [])]
     return {name: k for k, name in enumerate(names, len(report.ocp.system.names))}
 
 
 def valued(report: Results) -> Judged | None:
-    """The first method with a value function."""
+    """The first method with a value function V(x, t[, p])."""
     return next((j for j in report.judged if j.value is not None), None)
 
 
@@ -117,16 +117,18 @@ def _index(report: Results, i: int) -> int:
 
 def _method(report: Results, j: Judged, nodes: int, states: NDArray[np.integer[Any]]) -> dict[str, Any]:
     s = j.simulation
-    index = np.unique(np.rint(np.linspace(0, len(s.t) - 1, min(nodes, len(s.t)))).astype(int))
+    last, free = s.x.shape[1] - 1, report.ocp.is_free
+    index = np.unique(np.rint(np.linspace(0, last, min(nodes, last + 1))).astype(int))
     parts = [s.x[states], s.u[states], cost_to_go(report, j)[states, :, None]]  # in the order of `channels`
     run = np.concatenate([part[:, index] for part in parts], axis=2)
     if (owner := valued(report)) is not None:
         along = values_along(owner, s.t[index], s.x[states][:, index], report.parameters[states])
         run = np.concatenate([run, along[..., None]], axis=2)
     run = np.concatenate([run, limits.values(report.ocp, s, report.parameters)[states][:, index]], axis=2)
+    run = np.concatenate([run, s.times[states][:, index, None]], axis=2) if free else run
     numbers = np.stack([read(j) for read in NUMBERS.values()], axis=1)
     failed = {str(i): failure(report, report.judged.index(j), i) for i in np.flatnonzero(~j.feasible)}
-    return {"name": j.name, "how": j.how, "held": j.held, "t": s.t[index].tolist(), "failed": failed,
+    return {"name": j.name, "how": j.how, "held": j.held, "t": None if free else s.t[index].tolist(), "failed": failed,
             "numbers": floats(numbers), **quantised(run)}
 
 
@@ -148,8 +150,9 @@ def cost_to_go(report: Results, j: Judged) -> Array:
     """[B, K+1], what a run still costs at its nodes: L by trapezoids, scaled so that it starts at the judged cost."""
     s, ocp, p = j.simulation, report.ocp, report.parameters
     end = s.u[:, :-1] if j.held else s.u[:, 1:]
-    first, last = _running(ocp, s.t[:-1], s.x[:, :-1], s.u[:, :-1], p), _running(ocp, s.t[1:], s.x[:, 1:], end, p)
-    steps = 0.5 * np.diff(s.t) * (first + last)
+    t = s.times
+    first, last = _running(ocp, t[:, :-1], s.x[:, :-1], s.u[:, :-1], p), _running(ocp, t[:, 1:], s.x[:, 1:], end, p)
+    steps = 0.5 * np.diff(t) * (first + last)
     total = steps.sum(axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
         steps = steps * np.where(np.abs(total) > 0, s.running_cost / total, 1.0)[:, None]
@@ -158,9 +161,9 @@ def cost_to_go(report: Results, j: Judged) -> Array:
 
 
 def _running(ocp: OCP, t: Array, x: Array, u: Array, p: Array) -> Array:
-    """[B, K], L at t [K], x [B, K, nx], u [B, K, nu], p [B, np]."""
+    """[B, K], L at t [B, K], x [B, K, nx], u [B, K, nu], p [B, np]."""
     (B, K), of = x.shape[:2], ocp.functions
-    given = of.arguments.columns(x=x.reshape(B * K, -1), u=u.reshape(B * K, -1), t=np.tile(t, B), p=np.repeat(p, K, 0))
+    given = of.arguments.columns(x=x.reshape(B * K, -1), u=u.reshape(B * K, -1), t=t.ravel(), p=np.repeat(p, K, 0))
     return np.asarray(of.L(*given).full().reshape(B, K))
 
 

@@ -34,10 +34,7 @@ class Report(Results):
         ----------
         animation : whether to make animation.gif, of the first two methods side by side; default: up to 200 states
         draw : how the system is drawn there: see nocl.comparisons.report.animate
-
-        Raises ValueError where the horizon is free: the page has one axis of time for all runs.
         """
-        self.ocp.refuse_free("Report.save: the page")
         from nocl.comparisons.report.files import write_report  # matplotlib is imported where pictures are drawn
 
         return write_report(self, Path(folder), animation, draw)

@@ -23,9 +23,10 @@ from nocl.comparisons.report.findings import (
     per_cent,
     percentile,
 )
+from nocl.definition import measured
+from nocl.definition.ocp import OCP
+from nocl.definition.scales import usual_sizes
 from nocl.judge.runs import Simulation
-from nocl.ocp import OCP
-from nocl.scales import usual_sizes
 from nocl.support.checks import Array
 
 REFERENCE = "reference"  # the name of a yardstick among the methods: its speed is no method's
@@ -120,6 +121,12 @@ class Results:
         that count: not those from which no plan holds the constraints.
         """
         return Summary(self._summarize(m) for m in range(len(self.judged)))
+
+    @property
+    def last(self) -> float:
+        """The horizon; where it is free, when the last run ends."""
+        ends = np.concatenate([j.simulation.times[:, -1] for j in self.judged if self.ocp.is_free] or [[]])
+        return float(ends[np.isfinite(ends)].max(initial=0.0)) or self.ocp.longest
 
     @property
     def parameters(self) -> Array:
@@ -217,14 +224,14 @@ class Results:
         """Which constraints a method violates, by how much at most, on how many states that count, in words."""
         j, worst = self.judged[m], dict[str, list[int]]()
         for i in np.flatnonzero(j.violates & self.counted):
-            name, _ = self.ocp.excess(int(j.simulation.worst[i]), float(j.simulation.violation[i]))
+            name, _ = measured.excess(self.ocp, int(j.simulation.worst[i]), float(j.simulation.violation[i]))
             worst.setdefault(name, []).append(int(i))
         return ", ".join(self._violation(j, name, states) for name, states in worst.items())
 
     def _violation(self, judged: Judged, name: str, states: Sequence[int]) -> str:
         s = judged.simulation
         i = max(states, key=lambda state: s.violation[state])
-        _, much = self.ocp.excess(int(s.worst[i]), float(s.violation[i]))
+        _, much = measured.excess(self.ocp, int(s.worst[i]), float(s.violation[i]))
         return f"{name!r} by {much} ({len(states)} of {self.counted.sum()})"
 
     def within(self, percent: float) -> Mask:

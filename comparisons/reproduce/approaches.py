@@ -18,7 +18,7 @@ import numpy as np
 from nocl.comparisons.reproduce import table
 from nocl.comparisons.reproduce.dubins import rollout_ms
 from nocl.comparisons.reproduce.table import Place, grid
-from nocl.ocp import OCP
+from nocl.definition.ocp import OCP
 from nocl.solvers.cnd.controller import pretrained
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP

@@ -22,8 +22,8 @@ import numpy as np
 from nocl.comparisons.reproduce import table
 from nocl.comparisons.reproduce.dubins import INTERVALS, rollout_ms
 from nocl.comparisons.reproduce.table import Place
+from nocl.definition.ocp import OCP
 from nocl.judge.simulation import simulate
-from nocl.ocp import OCP
 from nocl.solvers.cnd.controller import pretrained
 from nocl.solvers.cnd.paper import PaperSettings
 from nocl.solvers.cnd.settings import TrainSettings

@@ -18,9 +18,9 @@ import numpy as np
 
 from nocl.comparisons.reproduce import table
 from nocl.comparisons.reproduce.table import Place, grid, small
+from nocl.definition.ocp import OCP
 from nocl.judge.runs import Simulation
 from nocl.judge.simulation import simulate
-from nocl.ocp import OCP
 from nocl.solvers.cnd.controller import pretrained
 from nocl.solvers.cnd.paper import PaperSettings
 from nocl.solvers.cnd.training import train

@@ -20,7 +20,7 @@ from nocl.support.lock import alone
 from nocl.systems import NAMES, load_ocp
 
 if TYPE_CHECKING:
-    from nocl.ocp import OCP
+    from nocl.definition.ocp import OCP
 
 QUICK_PROOF = ("casadi", "onnx", "c")  # of a run: L4CasADi takes half a minute to build
 SEED = ("of all that is drawn; the initial states that methods are run from are drawn with one more, "
@@ -224,8 +224,8 @@ def _run(args: argparse.Namespace) -> None:
     from nocl.cli.run_folder import RunFolder  # torch
 
     ocp, out = _problem(args)
-    ocp.refuse_free("nocl run")
     if not args.exact:
+        ocp.refuse_free("nocl run without --exact")
         _check_learnable(ocp)
     stages = RunFolder(ocp, out, args.seed, args.effort, args.minutes, args.intervals)
     stages.check(exact=args.exact)

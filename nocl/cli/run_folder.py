@@ -28,10 +28,10 @@ from nocl.comparisons.methods import Solving, Starts, own_rate, runs_of
 from nocl.comparisons.report.results import count
 from nocl.comparisons.studies import study
 from nocl.data import TINY
+from nocl.definition.ocp import OCP
+from nocl.definition.scales import usual_sizes
 from nocl.exports.bundle import export
 from nocl.judge.simulation import simulate
-from nocl.ocp import OCP
-from nocl.scales import usual_sizes
 from nocl.solvers import registry
 from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.settings import TrainSettings

@@ -13,6 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
+from nocl.definition.system import System
 from nocl.exports import parity
 from nocl.exports.c_code import load
 from nocl.exports.casadi_forms import to_casadi
@@ -22,7 +23,6 @@ from nocl.exports.parity import Certificate, ExportPart, Finding
 from nocl.support import checks, compiler, store
 from nocl.support.atomic import part_of, remove_parts
 from nocl.support.checks import Array
-from nocl.system import System
 
 STEPS = {"casadi": ("casadi",), "l4casadi": ("l4casadi",), "onnx": ("onnx",), "c": ("c", "c_float32")}  # of each form
 FORMS = tuple(STEPS)

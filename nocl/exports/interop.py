@@ -9,12 +9,12 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nocl import parameters
-from nocl.ocp import OCP
+from nocl.definition import parameters
+from nocl.definition.ocp import OCP
+from nocl.definition.system import System
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.support.packages import package
-from nocl.system import System
 
 Step = Callable[[Array, Array, float, Array], tuple[Array, float]]  # (x, u, t, p) -> (x after it, its cost)
 EDGE = 1e-9  # of an interval: how long a held control takes to become the next

@@ -15,6 +15,7 @@ import casadi as ca
 import numpy as np
 from scipy.optimize import brentq, minimize_scalar
 
+from nocl.definition import measured
 from nocl.judge.runs import MULTISTEP, Ask, Judge, Simulation
 from nocl.support.checks import Array
 
@@ -124,7 +125,7 @@ class _Run:
                 nearest, when, there = off.min(), times[off.argmin()], np.vstack([z, path])[off.argmin()]
             z = path[-1]
         row = int(self.off(there[None])[0].argmax()) + len(self.judge.ocp.functions.rows)
-        name, much = self.judge.ocp.excess(row, float(nearest))
+        name, much = measured.excess(self.judge.ocp, row, float(nearest))
         return float(free.high), (f"does not arrive within {free.high:g}: at best {name!r} is off by {much}, at "
                                   f"t = {when:.4g}")
 
@@ -135,7 +136,7 @@ class _Run:
     def off(self, z: Array) -> Array:
         """[n, m], by which share of its scale each terminal constraint is violated at z [n, nx + 1]."""
         ocp = self.judge.ocp
-        at_end = ocp.least_at_end(z[:, :-1], np.repeat(self.judge.p, len(z), axis=0))
+        at_end = measured.least_at_end(ocp, z[:, :-1], np.repeat(self.judge.p, len(z), axis=0))
         return np.maximum(-at_end / ocp.functions.end_scales, 0)
 
     def _first(self, times: Array, off: Array, z: Array, k: int) -> float | None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import casadi as ca
 
-from nocl.ocp import OCP
+from nocl.definition.ocp import OCP
 from nocl.support.checks import Array
 
 

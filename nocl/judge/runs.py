@@ -13,9 +13,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from nocl.ocp import OCP
-from nocl.scales import units
-from nocl.smoothness import kinks
+from nocl.definition import measured
+from nocl.definition.ocp import OCP
+from nocl.definition.scales import units
+from nocl.definition.smoothness import kinks
 from nocl.support import interrupt
 from nocl.support.checks import Array
 from nocl.translate.arguments import Arguments
@@ -45,11 +46,16 @@ class Simulation:
     saturation: Array  # [B], share of time with a control at a bound
     clearance: Array  # [B], min of all constraints, at and between nodes, and at the end, in units of their scales; of
     # a problem with path constraints alone in their own units; inf if there are none
-    violation: Array  # [B], the largest of any, as a share of that constraint's own scale (OCP.violation); 0: none
+    violation: Array  # [B], the largest of any, as a share of that constraint's own scale; 0: none
     success: NDArray[np.bool_]  # [B], whether it reached the horizon with all constraints held
     message: Sequence[str]  # [B], "" or what failed, at which time and state; or what is violated, and by how much
     reached: NDArray[np.bool_]  # [B], whether it reached the horizon
-    worst: NDArray[np.int64]  # [B], which row of OCP.shares is violated most; -1: none is
+    worst: NDArray[np.int64]  # [B], which row of `measured.shares` is violated most; -1: none is
+
+    @property
+    def times(self) -> Array:
+        """[B, K+1], the nodes of each run."""
+        return np.broadcast_to(self.t, self.x.shape[:2])
 
 
 class Judge:
@@ -167,9 +173,9 @@ class Judge:
         z[:, :nx] += sum(dx for time, dx in jumps if time == t[-1])
         x[:, -1] = z[:, :nx]
         if self.ocp.states_only:
-            least = self.ocp.least(x, t, self.p)
+            least = measured.least(self.ocp, x, t, self.p)
         else:
-            least = self.ocp.least_held(x, self.answers(policy, x, t), t, self.p)
+            least = measured.least_held(self.ocp, x, self.answers(policy, x, t), t, self.p)
         x, t = x[:, ::m].copy(), nodes
         u = self.answers(policy, x, t)
         weight = np.gradient(t) * np.r_[0.5, np.ones(len(t) - 2), 0.5] if len(t) > 2 else np.diff(t).repeat(2) / 2
@@ -213,15 +219,15 @@ class Judge:
         """Least values of the constraints on the way from `start` [B, 1, nx] along `path` [B, m, nx] under u [B, nu];
         t [m + 1] are the times of both."""
         if self.ocp.states_only:
-            return self.ocp.least(path, t[1:], self.p)
+            return measured.least(self.ocp, path, t[1:], self.p)
         x = np.concatenate([start, path], axis=1)
-        return self.ocp.least_held(x, np.repeat(u[:, None], len(t), axis=1), t, self.p)
+        return measured.least_held(self.ocp, x, np.repeat(u[:, None], len(t), axis=1), t, self.p)
 
     def at_nodes(self, x: Array, u: Array, t: Array) -> Array:
         """Those at the nodes; constraints that hold the control were looked at on the way."""
         if self.ocp.states_only:
-            return self.ocp.least(x, t, self.p)
-        return self.ocp.least_held(x, u[:, :0], t, self.p)
+            return measured.least(self.ocp, x, t, self.p)
+        return measured.least_held(self.ocp, x, u[:, :0], t, self.p)
 
     def at_bound(self, u: Array) -> Array:
         """Whether any control is at a bound, [B, K], as 0 or 1."""
@@ -244,14 +250,14 @@ class Judge:
         off = np.linalg.norm(ocp.from_goal(x[:, -1], self.p), axis=1) if ocp.has_goal else np.nan
         error = np.where(reached, off, np.inf)
         u[~np.isfinite(x).all(axis=2)] = np.nan
-        at_end = ocp.least_at_end(x[:, -1], self.p)
-        violation, worst = ocp.violation(least, at_end), self.worst(ocp.shares(least, at_end))
+        at_end = measured.least_at_end(ocp, x[:, -1], self.p)
+        violation, worst = measured.violation(ocp, least, at_end), self.worst(measured.shares(ocp, least, at_end))
         beyond = reached & (violation > self.tolerance)
         for i in np.flatnonzero(beyond):
-            name, much = ocp.excess(worst[i], violation[i])
+            name, much = measured.excess(ocp, worst[i], violation[i])
             message[i] = f"violates {name!r} by {much}"
         return Simulation(t, x, u, running + terminal, running, terminal, error, np.where(reached, magnitude, np.nan),
-                          np.where(reached, saturation, np.nan), ocp.nearest(least, at_end), violation,
+                          np.where(reached, saturation, np.nan), measured.nearest(ocp, least, at_end), violation,
                           reached & ~beyond, message, reached, worst)
 
     @staticmethod

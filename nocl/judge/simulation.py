@@ -25,11 +25,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nocl.constraints import TOLERANCE
+from nocl.definition.constraints import TOLERANCE
+from nocl.definition.ocp import OCP
 from nocl.judge.arrival import arriving, arriving_held, planned
 from nocl.judge.laws import answer_of, check_made_for, check_takes_p, dynamics_function, policy_function, takes_p
 from nocl.judge.runs import Ask, Judge, Simulation
-from nocl.ocp import OCP
 from nocl.support import checks
 from nocl.support.checks import Array
 

@@ -19,13 +19,13 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from nocl.data import Dataset
+from nocl.definition.system import System
 from nocl.support import checks, store
 from nocl.support.checks import Array
 from nocl.sysid.from_log import first_states
 from nocl.sysid.identification import LearnedDynamics, identify
 from nocl.sysid.logs.coverage import share_of_nodes
 from nocl.sysid.logs.log import Log
-from nocl.system import System
 
 CARD = "ensemble.json"
 USUAL = 0.99  # share of the samples that were learned from whose disagreement is below `usual`

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from nocl.data import Dataset
+from nocl.definition.system import System
 from nocl.support.checks import Array
-from nocl.system import System
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -16,8 +16,8 @@ from scipy.optimize import minimize
 from torch import Tensor
 from torch.func import jacrev, vmap
 
+from nocl.definition.substeps import FINEST, Grid, grid_of
 from nocl.nets import MLP, FeatureNet
-from nocl.substeps import FINEST, Grid, grid_of
 from nocl.support.checks import Array
 from nocl.sysid import fitting
 from nocl.sysid.logs.derivatives import labels

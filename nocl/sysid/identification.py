@@ -22,13 +22,15 @@ import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
-from nocl import records, sampling
+from nocl import records
 from nocl.data import Dataset
+from nocl.definition import sampling
+from nocl.definition.parameters import rows as parameter_rows
+from nocl.definition.sampling import Distribution, Gaussian, Seed, Uniform
+from nocl.definition.system import System
 from nocl.exports.casadi_forms import to_casadi
 from nocl.exports.parity import ExportPart
 from nocl.nets import MLP, FeatureNet
-from nocl.parameters import rows as parameter_rows
-from nocl.sampling import Distribution, Gaussian, Seed, Uniform
 from nocl.support import checks
 from nocl.support.budget import ENDLESS, Budget
 from nocl.support.checks import Array
@@ -59,7 +61,6 @@ from nocl.sysid.settings import LogSettings, PaperSettings, Settings
 from nocl.sysid.stated import Known, Stated
 from nocl.sysid.structure import Expansion, Group, Split, Structure, Variables
 from nocl.sysid.trial import better_affine
-from nocl.system import System
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -9,7 +9,8 @@ import casadi as ca
 import numpy as np
 
 from nocl.data import Dataset
-from nocl.sampling import Distribution, open_box
+from nocl.definition.sampling import Distribution, open_box
+from nocl.definition.system import System
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
 from nocl.sysid import structure as structures
@@ -17,7 +18,6 @@ from nocl.sysid.affine import stated_affine
 from nocl.sysid.settings import Settings
 from nocl.sysid.stated import Stated
 from nocl.sysid.structure import Oracle, Structure, Variables
-from nocl.system import System
 
 CHUNK = 100_000  # labels of f held at a time
 MIN_ROWS = 2048  # of labels, however many labels of f one takes

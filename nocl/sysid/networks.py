@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from nocl.definition.system import System
 from nocl.nets import MLP, FeatureNet
 from nocl.support.checks import Array
 from nocl.sysid import fitting
@@ -20,7 +21,6 @@ from nocl.sysid.plain import train as train_plain
 from nocl.sysid.progress import Checkpoint, Progress
 from nocl.sysid.settings import Budget, Settings
 from nocl.sysid.structure import Group, Structure, Variables
-from nocl.system import System
 from nocl.translate.arguments import Arguments
 
 MAX_POLISHED = 2600  # parameters: beyond, a Levenberg-Marquardt step costs more than it gives

@@ -7,13 +7,13 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from nocl.definition.system import System
 from nocl.support import store
 from nocl.support.budget import ENDLESS, Budget
 from nocl.support.progress import Bar
 from nocl.support.progress import bar as progress_bar
 from nocl.sysid import fitting
 from nocl.sysid.settings import Settings
-from nocl.system import System
 
 TRIAL = 0.1  # of the time that is left, for one
 

@@ -10,11 +10,11 @@ import casadi as ca
 import numpy as np
 
 from nocl.data import Dataset
+from nocl.definition.system import System
 from nocl.support import checks
 from nocl.sysid import structure as structures
 from nocl.sysid.affine import split_at
 from nocl.sysid.structure import Expansion, Group, Oracle, Split, Structure, Variables
-from nocl.system import System
 
 Known = Mapping[str, Any] | Iterable[str]
 

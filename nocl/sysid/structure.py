@@ -31,8 +31,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from nocl import pretty
 from nocl.data import Dataset
+from nocl.definition import pretty
 from nocl.support.checks import Array
 from nocl.translate.arguments import Arguments
 

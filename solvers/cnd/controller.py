@@ -20,12 +20,12 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from nocl import records
+from nocl.definition.ocp import OCP
 from nocl.exports.bundle import export
 from nocl.exports.casadi_forms import to_casadi
 from nocl.exports.parity import Certificate, ExportPart
 from nocl.judge.laws import dynamics_function
 from nocl.nets import FeatureNet
-from nocl.ocp import OCP
 from nocl.solvers.cnd.regression.features import at_rate, folded
 from nocl.solvers.cnd.regression.labels import LONGEST
 from nocl.solvers.cnd.unwrapped import Unwrapped

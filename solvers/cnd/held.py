@@ -17,9 +17,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from nocl.constraints import TOLERANCE
 from nocl.data import Solution
-from nocl.ocp import OCP
+from nocl.definition import measured
+from nocl.definition.constraints import TOLERANCE
+from nocl.definition.ocp import OCP
 from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.cnd.regression.labels import Policy, Problems, continuous_run
 from nocl.solvers.cnd.regression.projection import projected
@@ -67,9 +68,9 @@ class Held:
     def labels(self, solution: Solution) -> Solution:
         """The same, without success where a plan leaves by more than LOST what x0 alone does not decide."""
         s, later, n = solution, slice(1, None), self.ocp.functions.rows.n_x
-        least = self.ocp.least_held(s.x, s.u, s.t, s.parameters)
-        least[:, :n] = self.ocp.least_held(s.x[:, later], s.u[:, later], s.t[:, later], s.parameters)[:, :n]
-        over = self.ocp.violation(least, self.ocp.least_at_end(s.x[:, -1], s.parameters))
+        least = measured.least_held(self.ocp, s.x, s.u, s.t, s.parameters)
+        least[:, :n] = measured.least_held(self.ocp, s.x[:, later], s.u[:, later], s.t[:, later], s.parameters)[:, :n]
+        over = measured.violation(self.ocp, least, measured.least_at_end(self.ocp, s.x[:, -1], s.parameters))
         return replace(s, success=s.success & (over <= LOST))
 
     def exceeded(self, policy: Policy, torch_ocp: InTorch, at: Problems, steps: int) -> Array:
@@ -81,7 +82,8 @@ class Held:
         here, flat = torch_ocp.at(np.repeat(at.p, nodes, axis=0)), torch.from_numpy(x.reshape(B * nodes, x.shape[2]))
         with torch.no_grad():
             u = policy(flat, torch.from_numpy(t.reshape(-1, 1)), *here.p).numpy().reshape(B, nodes, self.ocp.system.nu)
-        least = np.hstack([self.ocp.least_held(x, u, t, at.p), self.ocp.least_at_end(x[:, -1], at.p)])
+        along, at_end = measured.least_held(self.ocp, x, u, t, at.p), measured.least_at_end(self.ocp, x[:, -1], at.p)
+        least = np.hstack([along, at_end])
         lost = ~np.isfinite(x[:, -1]).all(axis=1)
         return np.where(lost[:, None], np.inf, -least / self.scales)
 

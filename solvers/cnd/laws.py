@@ -19,11 +19,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from nocl.constraints import TOLERANCE
 from nocl.data import Solution
+from nocl.definition import measured
+from nocl.definition.constraints import TOLERANCE
+from nocl.definition.ocp import OCP
+from nocl.definition.sampling import own_numbers
+from nocl.definition.substeps import FINE
 from nocl.judge.simulation import simulate
-from nocl.ocp import OCP
-from nocl.sampling import own_numbers
 from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.regression.features import net_on, without_clock
 from nocl.solvers.cnd.regression.in_torch import InTorch
@@ -34,7 +36,6 @@ from nocl.solvers.cnd.validate import summary
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.nodes import NodeBank
 from nocl.solvers.ddp.solver import DDP, substeps_for
-from nocl.substeps import FINE
 from nocl.support.checks import Array
 from nocl.support.progress import Bar, within
 from nocl.support.progress import bar as progress_bar
@@ -226,7 +227,7 @@ class LawTraining:
         """[B, steps+1], whether states are not yet where it ends, and not far out of X."""
         B, n, nx = states.shape
         flat = states.reshape(-1, nx)
-        at_end = self.ocp.least_at_end(flat, np.repeat(p, n, axis=0)) / self.ocp.functions.end_scales
+        at_end = measured.least_at_end(self.ocp, flat, np.repeat(p, n, axis=0)) / self.ocp.functions.end_scales
         far = FAR * np.maximum(np.abs(self.ocp.system.lbx), np.abs(self.ocp.system.ubx))
         arrived = (at_end >= -TOLERANCE).all(axis=1).reshape(B, n)
         before = ~np.maximum.accumulate(arrived, axis=1)

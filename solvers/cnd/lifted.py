@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nocl.definition.ocp import OCP
+from nocl.definition.parameters import time
+from nocl.definition.sampling import Uniform, box, open_box
+from nocl.definition.system import System
 from nocl.nets import MLP, FeatureNet
-from nocl.ocp import OCP
-from nocl.parameters import time
-from nocl.sampling import Uniform, box, open_box
 from nocl.support.checks import Array
-from nocl.system import System
 
 
 class Lifted:

@@ -35,8 +35,8 @@ from torch import Tensor
 from torch.func import functional_call, stack_module_state
 
 from nocl import hjb
+from nocl.definition.ocp import OCP
 from nocl.nets import MLP, FeatureNet
-from nocl.ocp import OCP
 from nocl.solvers.cnd.lifted import Lifted
 from nocl.solvers.cnd.settings import STEPS, PaperSettings, identity
 from nocl.support import store

@@ -19,8 +19,8 @@ import casadi as ca
 import numpy as np
 import torch
 
-from nocl.ocp import OCP
-from nocl.sampling import own_numbers
+from nocl.definition.ocp import OCP
+from nocl.definition.sampling import own_numbers
 from nocl.solvers.cnd.regression.features import at_rate, policy_net
 from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.cnd.regression.labels import NEIGHBOURS, PROBED, Labels, Problems, continuous_cost, tube

@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 import torch
 
 from nocl import hjb
+from nocl.definition.ocp import OCP
 from nocl.nets import ACTIVATIONS, FeatureNet
-from nocl.ocp import OCP
 from nocl.support import checks
 from nocl.support.fields import Checked, Scaled, choice, coefficients, count, flag, nonnegative, positive, widths
 from nocl.support.fingerprint import fingerprint, json_text

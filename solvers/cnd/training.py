@@ -28,10 +28,11 @@ import numpy as np
 import torch
 
 from nocl.data import Solution
+from nocl.definition.ocp import OCP
+from nocl.definition.sampling import own_numbers
+from nocl.definition.substeps import FINE
 from nocl.exports import parity
 from nocl.nets import FeatureNet
-from nocl.ocp import OCP
-from nocl.sampling import own_numbers
 from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.held import Held
 from nocl.solvers.cnd.laws import LawTraining, check_law
@@ -74,7 +75,6 @@ from nocl.solvers.ddp.bank import SolutionBank, better, extend
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.opinion import second_opinion
 from nocl.solvers.ddp.solver import DDP, substeps_for
-from nocl.substeps import FINE
 from nocl.support import checks, store
 from nocl.support.budget import ENDLESS, Budget
 from nocl.support.checks import Array

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nocl.ocp import OCP
+from nocl.definition.ocp import OCP
 from nocl.support import checks
 from nocl.support.checks import Array
 

@@ -10,9 +10,10 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from torch import Tensor
 
 from nocl.data import Solution
+from nocl.definition import measured
+from nocl.definition.ocp import OCP
 from nocl.hjb import hjb_residual
 from nocl.nets import FeatureNet
-from nocl.ocp import OCP
 from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.cnd.regression.labels import (
     SMALL,
@@ -71,7 +72,7 @@ def feasible(ocp: OCP, s: Solution) -> Solution:
     of the penalty."""
     if not ocp.h_titles:
         return s
-    return s[(ocp.least(s.x, s.t, s.parameters) >= 0).all(axis=1)]
+    return s[(measured.least(ocp, s.x, s.t, s.parameters) >= 0).all(axis=1)]
 
 
 def tube_optima(ddp: DDP, fine: DDP, bank: SolutionBank, policy: Policy, torch_ocp: InTorch, n: int, width: float,

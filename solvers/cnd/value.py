@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 from nocl.data import Solution
+from nocl.definition.ocp import OCP
 from nocl.nets import MLP, FeatureNet
-from nocl.ocp import OCP
 from nocl.solvers.cnd.loss_kernel import ValueKernel
 from nocl.solvers.cnd.regression.features import features
 from nocl.solvers.cnd.regression.in_torch import InTorch

@@ -17,8 +17,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from nocl.constraints import TOLERANCE
-from nocl.scales import usual_sizes
+from nocl.definition.constraints import TOLERANCE
+from nocl.definition.scales import usual_sizes
 from nocl.solvers.between import CUTS
 from nocl.solvers.ddp.batch import Rows
 from nocl.solvers.ddp.work import BLEW_UP, CONVERGED, NOT_CONVEX, NOT_HELD, OUTSIDE, RUNNING, Work

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nocl.data import Solution
-from nocl.ocp import OCP
+from nocl.definition.ocp import OCP
 from nocl.support.checks import Array
 
 Rows = NDArray[np.int64]  # problem numbers

@@ -11,8 +11,8 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from nocl.ocp import OCP
-from nocl.parameters import time
+from nocl.definition.ocp import OCP
+from nocl.definition.parameters import time
 from nocl.support.checks import Array
 from nocl.translate.arguments import Arguments
 from nocl.translate.kernels import emit

@@ -16,17 +16,17 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from nocl.constraints import Free
 from nocl.data import Solution
-from nocl.ocp import OCP
-from nocl.parameters import time
-from nocl.sampling import Distribution, Gaussian, Uniform
-from nocl.scales import units
+from nocl.definition.constraints import Free
+from nocl.definition.ocp import OCP
+from nocl.definition.parameters import time
+from nocl.definition.sampling import Distribution, Gaussian, Uniform
+from nocl.definition.scales import units
+from nocl.definition.system import System
 from nocl.solvers.ddp.augmented import KEPT, LARGEST, Augmented
 from nocl.solvers.ddp.batch import Rows
 from nocl.solvers.starts import middle
 from nocl.support.checks import Array
-from nocl.system import System
 
 FASTER, SLOWER = 0.5, 1.0  # shares of T by which a step may shorten and lengthen it: half, and twice as long
 FAR = 0.01  # of a scale: while a constraint is off by more, T grows only: in a shorter time less can be held

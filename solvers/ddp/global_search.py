@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from nocl.data import Solution
+from nocl.definition.ocp import OCP
+from nocl.definition.sampling import Seed
 from nocl.judge.laws import dynamics_function
-from nocl.ocp import OCP
-from nocl.sampling import Seed
 from nocl.solvers.ddp.bank import SolutionBank
 from nocl.solvers.ddp.batch import bytes_each
 from nocl.solvers.ddp.solver import DDP

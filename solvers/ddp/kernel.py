@@ -10,11 +10,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from nocl.functions import Stage
-from nocl.ocp import OCP
-from nocl.scales import units, usual_sizes
+from nocl.definition.functions import Stage
+from nocl.definition.ocp import OCP
+from nocl.definition.scales import units, usual_sizes
+from nocl.definition.substeps import RADAU, RK4
 from nocl.solvers.ddp.constraints import ConstraintRows, rows_source
-from nocl.substeps import RADAU, RK4
 from nocl.support.checks import Array
 from nocl.translate import radau
 from nocl.translate.kernels import emit

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from nocl.data import Solution
-from nocl.ocp import OCP
+from nocl.definition.ocp import OCP
 from nocl.solvers.ddp.bank import better
 from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array

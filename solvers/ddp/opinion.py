@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nocl.data import Solution
-from nocl.scales import usual_sizes
+from nocl.definition.scales import usual_sizes
 from nocl.solvers.ddp.bank import better
 from nocl.solvers.ddp.smoothing import without_kinks
 from nocl.solvers.ddp.solver import DDP

@@ -21,11 +21,11 @@ import casadi as ca
 import numpy as np
 
 from nocl.data import Solution
-from nocl.ocp import OCP
-from nocl.parameters import parameter, time
-from nocl.sampling import Distribution, Gaussian, Uniform
-from nocl.scales import usual_sizes
-from nocl.smoothness import rounded
+from nocl.definition.ocp import OCP
+from nocl.definition.parameters import parameter, time
+from nocl.definition.sampling import Distribution, Gaussian, Uniform
+from nocl.definition.scales import usual_sizes
+from nocl.definition.smoothness import rounded
 from nocl.solvers.ddp.batch import Piece, Rows
 from nocl.support.checks import Array
 

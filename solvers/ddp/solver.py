@@ -22,10 +22,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nocl.constraints import TOLERANCE
 from nocl.data import Solution
-from nocl.functions import Functions
-from nocl.ocp import OCP
+from nocl.definition.constraints import TOLERANCE
+from nocl.definition.functions import Functions
+from nocl.definition.ocp import OCP
+from nocl.definition.substeps import COARSE, INTEGRATORS, RK4, Grid, Steps, settled
 from nocl.solvers.between import EXCHANGES, MOST, SAME, Dips
 from nocl.solvers.ddp.augmented import Augmented
 from nocl.solvers.ddp.batch import Job, Piece, assembled, pieces
@@ -37,7 +38,6 @@ from nocl.solvers.ddp.without_compiler import ddp_kernel
 from nocl.solvers.ddp.work import CONVERGED, GROWTH, DDPSettings, Work
 from nocl.solvers.grid import fastest_at_start, firsts, followed, measured
 from nocl.solvers.starts import middle, random_start
-from nocl.substeps import COARSE, INTEGRATORS, RK4, Grid, Steps, settled
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
@@ -61,7 +61,7 @@ class DDP:
         K, the number of held controls on [t0, T].
     substeps : int, optional
         Steps in each interval. Default: 1, or where a few solutions from the OCP's initial states show that this is
-        too coarse for the plant, as many as they ask for (nocl/substeps.py); a warning says so.
+        too coarse for the plant, as many as they ask for (nocl/definition/substeps.py); a warning says so.
     integrator : "rk4" or "radau", optional
         Explicit Runge-Kutta steps, or implicit ones (Radau IIA, 3 stages), which stiff systems need. Default: implicit
         where substeps are left to nocl too, and explicit ones would be many; the warning says so.

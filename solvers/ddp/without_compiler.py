@@ -14,10 +14,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from nocl.ocp import OCP
+from nocl.definition.ocp import OCP
+from nocl.definition.substeps import RK4
 from nocl.solvers.ddp.constraints import Block, ConstraintRows, RowModel, parameters
 from nocl.solvers.ddp.kernel import damped, ddp_source
-from nocl.substeps import RK4
 from nocl.support.checks import Array
 from nocl.support.compiler import NoCompilerError
 from nocl.translate.arguments import Arguments

@@ -13,12 +13,13 @@ from typing import Any, Protocol
 import numpy as np
 
 from nocl.data import Solution
-from nocl.ocp import OCP
-from nocl.scales import usual_sizes
+from nocl.definition import measured
+from nocl.definition.ocp import OCP
+from nocl.definition.scales import usual_sizes
+from nocl.definition.substeps import RADAU, RK4
 from nocl.solvers.ddp.batch import Rows
 from nocl.solvers.ddp.constraints import ConstraintRows
 from nocl.solvers.ddp.without_compiler import NumpyKernel
-from nocl.substeps import RADAU, RK4
 from nocl.support.checks import Array
 from nocl.support.fields import Checked, count, positive
 from nocl.translate import radau
@@ -227,7 +228,7 @@ class Work:
         message = self._messages(t)
         success = self.state == CONVERGED
         seconds = np.full(B, (time.perf_counter() - self.begin) / max(B, 1))
-        clearance = self.ddp.posed.least(self.x, t, self.p).min(axis=1, initial=np.inf)
+        clearance = measured.least(self.ddp.posed, self.x, t, self.p).min(axis=1, initial=np.inf)
         return Solution(t, self.x, self.u, self.gain, V, V_x, np.where(success, self._cost(), np.inf), success,
                         np.array(message, dtype=np.str_), seconds, self.iterations, V_xx, clearance=clearance,
                         **known)

@@ -23,8 +23,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from nocl.hamiltonian import hamiltonian, minimiser
-from nocl.ocp import OCP
+from nocl.definition.hamiltonian import hamiltonian, minimiser
+from nocl.definition.ocp import OCP
 from nocl.support.checks import Array
 from nocl.translate.jax_functions import to_jax
 

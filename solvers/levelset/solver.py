@@ -27,8 +27,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.interpolate import NdBSpline, make_interp_spline
 
-from nocl.hamiltonian import minimiser
-from nocl.ocp import OCP
+from nocl.definition.hamiltonian import minimiser
+from nocl.definition.ocp import OCP
 from nocl.support import checks, store
 from nocl.support.checks import Array
 from nocl.support.progress import bar as progress_bar

@@ -7,8 +7,8 @@ import casadi as ca
 import numpy as np
 
 from nocl.data import Controller
+from nocl.definition.ocp import OCP
 from nocl.judge.laws import answer_of, takes_p
-from nocl.ocp import OCP
 from nocl.solvers.lqr import LQR
 from nocl.solvers.nmpc.transcription import Transcription
 from nocl.solvers.starts import HALVINGS, near, random_start, spread_horizon

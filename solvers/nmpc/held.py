@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from nocl.constraints import PATH, Rows
-from nocl.ocp import OCP
-from nocl.scales import steps, usual_sizes
+from nocl.definition.constraints import PATH, Rows
+from nocl.definition.ocp import OCP
+from nocl.definition.scales import steps, usual_sizes
 from nocl.support.checks import Array
 
 SOFT = 1e3  # usual costs that a violation by its scale costs at a node

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nocl.data import Solution, Trajectory
-from nocl.ocp import OCP
+from nocl.definition.ocp import OCP
 from nocl.support import checks
 from nocl.support.checks import Array
 

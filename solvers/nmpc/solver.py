@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nocl.data import Solution, Trajectory
+from nocl.definition.ocp import OCP
+from nocl.definition.substeps import INTEGRATORS, RADAU, RK4, Grid, Steps, settled
 from nocl.judge.laws import check_made_for, dynamics_function
-from nocl.ocp import OCP
 from nocl.solvers.grid import fastest_at_start, followed, measured
 from nocl.solvers.lqr import LQR
 from nocl.solvers.mirrors import Mirror, mirrors
@@ -29,7 +30,6 @@ from nocl.solvers.nmpc.tasks import Outcome, Task, attempt, failure, outside, so
 from nocl.solvers.nmpc.transcription import BACKENDS, Answer, Transcription
 from nocl.solvers.search import Found, Moves, Rows, Search
 from nocl.solvers.starts import middle
-from nocl.substeps import INTEGRATORS, RADAU, RK4, Grid, Steps, settled
 from nocl.support import checks, compiler
 from nocl.support.checks import Array
 from nocl.support.fingerprint import fingerprint
@@ -51,7 +51,7 @@ class NMPC:
     dynamics : casadi.Function (x, u[, t][, p]) -> xdot, or an object with `to_casadi()`; default: the exact f
     solver : "fatrop" (fast) or "ipopt" (reference); another nlpsol of CasADi's by its name
     substeps : steps in each interval; default: 1, or where the first solutions show that this is too coarse for the
-        plant, as many as they ask for (nocl/substeps.py); a warning says so
+        plant, as many as they ask for (nocl/definition/substeps.py); a warning says so
     integrator : "rk4", or "radau" for implicit steps (Radau IIA, 3 stages), whose stages are variables of the program;
         default: implicit where substeps are left to nocl too, and explicit ones would be many
     horizon : length of the window that is optimised, at most the OCP's horizon T (default); it ends at T at the latest

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from nocl.constraints import PATH, TOLERANCE
 from nocl.data import Solution
-from nocl.ocp import OCP
+from nocl.definition.constraints import PATH, TOLERANCE
+from nocl.definition.ocp import OCP
 from nocl.solvers.between import CUTS, EXCHANGES, MOST, SAME
 from nocl.solvers.nmpc.guesses import Guess
 from nocl.solvers.nmpc.transcription import (

@@ -21,12 +21,12 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from nocl.functions import Functions
-from nocl.ocp import OCP
-from nocl.scales import steps, units
+from nocl.definition.functions import Functions
+from nocl.definition.ocp import OCP
+from nocl.definition.scales import steps, units
+from nocl.definition.substeps import RADAU, RK4
 from nocl.solvers.between import Dips
 from nocl.solvers.nmpc.held import Block, Layout, layout
-from nocl.substeps import RADAU, RK4
 from nocl.support import compiler
 from nocl.support.checks import Array
 from nocl.support.guard import Guarded, NoAnswerError

@@ -31,10 +31,11 @@ const column = (name) => D.numbers.indexOf(name);
 const number = (m, i, name) => NUMBERS[m][i * D.numbers.length + column(name)];
 const place = new Map((D.kept || Array.from({length: B}, (_, i) => i)).map((i, row) => [i, row]));
 const opened = new Map();
+const times = (m, r) => D.methods[m].t || r[D.channels.time];  // of a run: its own where the horizon is free
 const run = (m, i) => place.has(i) ? unpacked(D.methods[m], place.get(i), place.size) : null;
 function unpacked(entry, row, rows) {  // [channel][node] of one of the packed runs
   if (!opened.has(entry)) opened.set(entry, {steps: new Uint16Array(bytes(entry.runs).buffer), limits: floats(entry.limits)});
-  const {steps, limits} = opened.get(entry), C = limits.length / 2 / rows, K = entry.t.length;
+  const {steps, limits} = opened.get(entry), C = limits.length / 2 / rows, K = steps.length / C / rows;
   return Array.from({length: C}, (_, c) => {
     const low = limits[(row * C + c) * 2], width = limits[(row * C + c) * 2 + 1] - low;
     return Array.from({length: K}, (_, k) => {
@@ -166,7 +167,7 @@ function drawRuns() {
       if (Math.min(...values) <= low + room) across(low, "dash");
       if (Math.max(...values) >= high - room) across(high, "dash");
     }
-    kept.forEach((r, m) => r && traces.push({type: "scatter", mode: "lines", x: D.methods[m].t, y: r[c], xaxis: "x" + id, yaxis: "y" + id,
+    kept.forEach((r, m) => r && traces.push({type: "scatter", mode: "lines", x: times(m, r), y: r[c], xaxis: "x" + id, yaxis: "y" + id,
       name: MNAMES[m], legendgroup: String(m), showlegend: k === 0, hovertemplate: `${MNAMES[m]}: %{y:.4g}<extra>t = %{x:.3g}</extra>`,
       line: line(m, k >= nx && !held && D.methods[m].held ? {shape: "hv"} : {})}));
   }
@@ -189,12 +190,12 @@ function drawAlong() {
   D.methods.forEach((method, m) => {
     const r = run(m, state);
     if (!r) return;
-    traces.push({type: "scatter", mode: "lines", name: MNAMES[m], x: method.t, y: r[D.channels.togo], line: line(m, {dash: "solid"}),
+    traces.push({type: "scatter", mode: "lines", name: MNAMES[m], x: times(m, r), y: r[D.channels.togo], line: line(m, {dash: "solid"}),
                  hovertemplate: `${MNAMES[m]} still costs %{y:.4g}<extra>t = %{x:.3g}</extra>`});
-    if ("V" in D.channels) traces.push({type: "scatter", mode: "lines", name: `V along ${MNAMES[m]}`, x: method.t, y: r[D.channels.V],
+    if ("V" in D.channels) traces.push({type: "scatter", mode: "lines", name: `V along ${MNAMES[m]}`, x: times(m, r), y: r[D.channels.V],
       line: line(m, {dash: "dot", width: 2}), hovertemplate: `V of ${owner} along ${MNAMES[m]}: %{y:.4g}<extra>t = %{x:.3g}</extra>`});
   });
-  $("alongnote").textContent = "What each run still costs, from t to the horizon" + (D.slices ? `; dotted: what ${D.slices.method}'s value function V(x(t), t) says along it.` : ".");
+  $("alongnote").textContent = "What each run still costs, from t to its end" + (D.slices ? `; dotted: what ${D.slices.method}'s value function V(x(t), t) says along it.` : ".");
   draw("along", traces, {xaxis: axis({title: {text: "t"}}), yaxis: axis({title: {text: "cost to go"}, rangemode: "tozero"})});
 }
 function obstacleTraces(i, k) {
@@ -214,7 +215,7 @@ function drawPhase() {
   D.methods.forEach((method, m) => {
     const r = run(m, state);
     if (!r) return;
-    traces.push({type: "scatter", mode: "lines", name: MNAMES[m], x: r[i], y: r[k], line: line(m), text: method.t.map(text),
+    traces.push({type: "scatter", mode: "lines", name: MNAMES[m], x: r[i], y: r[k], line: line(m), text: times(m, r).map(text),
                  hovertemplate: `${MNAMES[m]}, t = %{text}<extra>(%{x:.4g}, %{y:.4g})</extra>`});
     if (first) traces.push({type: "scatter", mode: "markers", name: "start", x: [r[i][0]], y: [r[k][0]], showlegend: false, hoverinfo: "skip",
                             marker: {symbol: "circle-open", size: 11, color: css("--text"), line: {width: 2}}});

@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import KDTree
 
+from nocl.definition.system import System
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.sysid.logs.log import Log
-from nocl.system import System
 
 POINTS = 2000  # of the log that are kept
 LEAST = 1e-9  # radius, where recordings repeat each other

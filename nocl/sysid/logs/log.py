@@ -18,14 +18,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nocl import parameters
+from nocl.definition import parameters
+from nocl.definition.system import System, counted
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.sysid.logs.columns import labels_of, numbers, rows_of, seconds
 from nocl.sysid.logs.files import Columns, read_table, write_table
 from nocl.sysid.logs.plausible import check_rate, check_rates, check_times, check_values, unwrapped
 from nocl.sysid.logs.smoothing import Smooth, smooth
-from nocl.system import System, counted
 
 TIME, RUN, PIECE = "t", "run", "run piece"  # columns of a file; the last is written, so that pieces stay apart
 LEAST = 5  # samples of a piece: fewer have no smoothed derivative

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 import casadi as ca
 import numpy as np
 
+from nocl.definition.ocp import OCP
+from nocl.definition.scales import usual_sizes
 from nocl.nets import MLP, FeatureNet
-from nocl.ocp import OCP
-from nocl.scales import usual_sizes
 from nocl.solvers.cnd.regression.projection import retracted
 from nocl.support import checks
 from nocl.support.checks import Array

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from nocl.ocp import OCP
+from nocl.definition.ocp import OCP
 from nocl.support.checks import Array
 from nocl.translate.rk4 import rk4_cost
 from nocl.translate.torch_functions import to_torch

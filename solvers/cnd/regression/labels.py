@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nocl.data import Solution
-from nocl.ocp import OCP
-from nocl.sampling import Uniform, box
+from nocl.definition.ocp import OCP
+from nocl.definition.sampling import Uniform, box
 from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.ddp.bank import Rows, SolutionBank, better, extend
 from nocl.solvers.ddp.solver import DDP

@@ -15,7 +15,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from nocl.ocp import OCP
+from nocl.definition.ocp import OCP
 from nocl.support.checks import Array
 
 CURVED = 1e-9  # of the largest entry: a Hessian's eigenvalue above that is not concave

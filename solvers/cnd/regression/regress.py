@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from nocl.definition.ocp import OCP
 from nocl.nets import FeatureNet
-from nocl.ocp import OCP
 from nocl.solvers.cnd.regression.labels import Labels
 from nocl.support.budget import ENDLESS, Budget
 from nocl.translate.torch_functions import to_torch

@@ -11,17 +11,18 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from nocl import constraints as limits
-from nocl import parameters as known
-from nocl import pretty, sampling
-from nocl.constraints import ALONG, BOUND, END, PATH, Constraint, Free, Places, Rows, Within
-from nocl.functions import Functions
-from nocl.sampling import Distribution, Gaussian, Seed, Uniform, box, short
-from nocl.smoothness import kinks, linear_controls
+from nocl.definition import constraints as limits
+from nocl.definition import parameters as known
+from nocl.definition import pretty, sampling
+from nocl.definition.constraints import ALONG, BOUND, END, PATH, Constraint, Free, Places, Rows, Within
+from nocl.definition.functions import Functions
+from nocl.definition.goals import Goal, Reference, beside, column, joined, text
+from nocl.definition.sampling import Distribution, Gaussian, Seed, Uniform, box, short
+from nocl.definition.smoothness import kinks, linear_controls
+from nocl.definition.system import System, check_unique, counted, parameter_text, read, refusal
 from nocl.support import checks
 from nocl.support.asked import answered
 from nocl.support.checks import MALFORMED, Array, Vector
-from nocl.system import System, check_unique, counted, parameter_text, read, refusal
 from nocl.translate import instructions
 from nocl.translate.instructions import check_scalar
 
@@ -71,7 +72,7 @@ class OCP:
         Constraints of these names, {"v": (-2, 2)}.
     scales : mapping from names of constraints to numbers > 0
         What violations, margins and tolerances of a constraint are shares of, in its own unit. Default: found from X, U
-        and where the problem takes place (nocl/constraints.py).
+        and where the problem takes place (nocl/definition/constraints.py).
     path_constraints : mapping from names to casadi.SX
         `constraints` of (x, t, p) alone, each >= 0 (an obstacle: distance minus radius), by their former name.
     penalty, penalty_margin : float
@@ -189,7 +190,7 @@ class OCP:
 
     def _goal(self, value: Any, n: int, name: str, owner: str) -> Array:
         """The goal's numbers, at the nominal p where it depends on p."""
-        value = _goal_column(getattr(value, "expression", value))
+        value = joined(getattr(value, "expression", value))
         if isinstance(value, ca.SX) and value.is_constant() and value.numel() == n:
             value = ca.DM(value).full().ravel()
         if not isinstance(value, ca.SX):
@@ -602,8 +603,8 @@ class OCP:
         goal may be expressions of p, and follows it.
         """
         owner = f"OCP on {checks.instance(System, system, 'system', 'OCP.quadratic').name!r}"
-        du = system.u - _symbolic(u_goal, system.nu, "u_goal", owner)
-        dx = system.x - _symbolic(x_goal, system.nx, "x_goal", owner)
+        du = system.u - column(u_goal, system.nu, "u_goal", owner)
+        dx = system.x - column(x_goal, system.nx, "x_goal", owner)
         return cls(system, running=_quadratic(checks.weight(R, system.nu, "R", owner), du),
                    terminal=_quadratic(checks.weight(P, system.nx, "P", owner), dx),
                    x_goal=x_goal, u_goal=u_goal, **options)
@@ -639,7 +640,7 @@ class OCP:
 
     @property
     def constraint_scales(self) -> Array:
-        """What violations of each row of h are measured by [number of them]: see nocl/constraints.py."""
+        """What violations of each row of h are measured by [number of them]: see nocl/definition/constraints.py."""
         return self.functions.scales[:self.functions.rows.n_h]
 
     def _measured(self) -> tuple[Array, Array]:
@@ -656,93 +657,10 @@ class OCP:
         at_end = limits.sizes(end, of.end, box, at_goal, self._box_of_x)
         return limits.joined(rows, np.array(along), given), limits.joined(end, at_end, given)
 
-    def least(self, x: Array, t: Any = None, p: Array | None = None) -> Array:
-        """The least value [B, number of them] of each row of h along states x [B, n, nx]; inf for NaN.
-
-        t [n] or [B, n] and p [B, np] where the problem has them.
-        """
-        n = self.system.nx
-        x = checks.numeric(x, "x", "OCP.least", f"states [B, n, {n}]")
-        if x.ndim != 3 or x.shape[2] != n or not x.shape[1]:
-            raise ValueError(f"OCP.least: x has shape {x.shape}; expected [B, n, {n}]")
-        if not self.functions.rows.n_h:
-            return np.full((len(x), 0), np.inf)
-        return _least(self.h(*self.functions.node.columns(**_flat(x, t, p))).full(), *x.shape[:2])
-
-    def least_held(self, x: Array, u: Array, t: Array, p: Array) -> Array:
-        """The least value [B, m] of each row of `functions.rows` along x [B, n, nx] and u [B, n, nu] at times t; of
-        equations -|c|. The first ones are those of `least`; u [B, n - 1, nu] says nothing of the last state.
-        """
-        of = self.functions
-        found, rows = self.least(x, t, p), of.rows
-        if len(rows) == rows.n_h:
-            return found
-        if rows.n_x > rows.n_h:
-            c = of.c_of_x(*of.node.columns(**_flat(x, t, p))).full()[rows.n_h:]
-            found = np.hstack([found, _least(-np.abs(c), *x.shape[:2])])
-        return np.hstack([found, self._least_of_u(x[:, :u.shape[1]], u, t, p)])
-
-    def _least_of_u(self, x: Array, u: Array, t: Array, p: Array) -> Array:
-        """Those of the rows that hold the control; x and u [B, n, nu] are of the same times, the first ones of t."""
-        of, rows = self.functions, self.functions.rows[self.functions.rows.n_x:]
-        if not len(rows) or not x.shape[1]:
-            return np.full((len(x), len(rows)), np.inf)
-        given = _flat(x, np.asarray(t)[..., :x.shape[1]], p)
-        c = of.c_of_u(*of.arguments.columns(**given, u=u.reshape(-1, self.system.nu))).full()
-        return _least(rows.signed(c), *x.shape[:2])
-
-    def least_at_end(self, x: Array, p: Array) -> Array:
-        """The value [B, m] of each row of `functions.end_rows` at x [B, nx]; of equations -|c|; inf for NaN."""
-        rows, of = self.functions.end_rows, self.functions
-        c = rows.signed(of.c_at_end(*of.end.columns(x=x, p=p)).full()) if len(rows) else np.zeros((0, len(x)))
-        return _least(c, len(x), 1)
-
-    def clearance(self, x: Array, u: Array, t: Array, p: Array) -> Array:
-        """The least of all constraints [B] at the nodes of trajectories x [B, K+1, nx], u [B, K, nu], as `nearest`."""
-        return self.nearest(self.least_held(x, u, t, p), self.least_at_end(x[:, -1], p))
-
     @property
     def in_scales(self) -> bool:
         """Whether clearances are in units of the constraints' scales: where there are any beside path constraints."""
         return bool(self.held_at_end) or any(one.kind != PATH for one in self.held)
-
-    def nearest(self, least: Array, end: Array) -> Array:
-        """The least of least values [B, m] along and [B, m] at the end, in scales; where the problem has path
-        constraints alone, in their own units. inf where there are none.
-        """
-        if self.in_scales:
-            least, end = least / self.functions.scales, end / self.functions.end_scales
-        return np.asarray(np.hstack([least, end]).min(axis=1, initial=np.inf))
-
-    def violation(self, least: Array, end: Array | None = None) -> Array:
-        """The largest violation of a constraint as a share of its scale [B], of least values [B, m] along the
-        trajectory (`least_held`; where all are of states alone, `least`) and at its end (`least_at_end`); 0: none.
-        """
-        m = len(self.functions.rows)
-        least = checks.numeric(least, "least", "OCP.violation", f"least values [B, {m}]")
-        if least.ndim != 2 or least.shape[1] != m or np.isnan(least).any():
-            raise ValueError(f"OCP.violation: least is {checks.shown(least)}; expected [B, {m}], as OCP.least gives it")
-        return np.asarray(self.shares(least, end).max(axis=1, initial=0.0)) + 0.0
-
-    def shares(self, least: Array, end: Array | None = None) -> Array:
-        """By how much each row along the way, and then at the end, is violated, as shares of their scales; < 0: it is
-        held. Least values as `violation` has them.
-        """
-        shares = -least / self.functions.scales
-        return shares if end is None else np.hstack([shares, -end / self.functions.end_scales])
-
-    def excess(self, row: int, share: float) -> tuple[str, str]:
-        """Whose row of `shares` it is, and a violation of it in its own unit: ("track", "0.12 m")."""
-        of = self.functions
-        one = (*of.rows.of, *of.end_rows.of)[row]
-        amount = share * np.concatenate([of.scales, of.end_scales])[row]
-        return one.name, f"{amount:.3g} {self._unit_of(one)}".rstrip()
-
-    def _unit_of(self, one: Constraint) -> str:
-        """The unit of a constraint whose expression is a state or a control; "" of any other."""
-        s = self.system
-        each = zip(s.names, ca.vertsplit(ca.vertcat(s.x, s.u)), strict=True)
-        return next((s.units.get(name, "") for name, z in each if ca.is_equal(one.expression, z)), "")
 
     @property
     def L_soft(self) -> ca.Function:
@@ -761,7 +679,7 @@ class OCP:
         lines += [pretty.filled(f"{one.name}{' at the end' * (one.kind == END)}: {one.text(e)}")
                   for one, e in zip(held, constraints, strict=True)]
         lines += [pretty.wrapped(name, e, "    ") for name, e in shared.items()]
-        goal = f"x* = {_goal_text(self.x_goal)}, u* = {_goal_text(self.u_goal)}" if self.has_goal else "none"
+        goal = f"x* = {text(self.x_goal)}, u* = {text(self.u_goal)}" if self.has_goal else "none"
         lines += [pretty.filled(f"goal: {goal}"), pretty.filled(f"x0 ~ {self.initial_states!r}")]
         if self.np:
             own = f", the problem's own: {parameter_text(self.p)}" if self.p.numel() else ""
@@ -846,72 +764,6 @@ def _constraints_from(data: Mapping[str, Any], at: Mapping[str, ca.SX]) -> dict[
     expressions = ca.vertsplit(read(data["e"], at))
     return {name: (low, e, high) for name, e, (low, high) in zip(data["names"], expressions, data["bounds"],
                                                                 strict=True)}
-
-
-def _flat(x: Array, t: Any, p: Array | None) -> dict[str, Any]:
-    """States x [B, n, nx] at times t [n] or [B, n], with parameters p [B, np], a row each."""
-    B, nodes = x.shape[:2]
-    return {"x": x.reshape(-1, x.shape[2]), "t": None if t is None else np.broadcast_to(t, (B, nodes)).ravel(),
-            "p": None if p is None else np.repeat(p, nodes, axis=0)}
-
-
-def _least(c: Array, B: int, nodes: int) -> Array:
-    """Rows [m, B * nodes] as their least values [B, m]; inf for NaN."""
-    if not B:
-        return np.full((0, len(c)), np.inf)
-    c = c.reshape(len(c), B, nodes)
-    return np.where(np.isfinite(c), c, np.inf).min(axis=2, initial=np.inf).T
-
-
-def beside(rows: Array, axes: int) -> Array:
-    """Rows [B, n] as they broadcast with an array [B, ..., n] of that many axes."""
-    return np.expand_dims(rows, tuple(range(1, axes - 1)))
-
-
-class Goal(np.ndarray[Any, np.dtype[np.float64]]):
-    """A goal that depends on p: its numbers at the nominal p, and its expression, which dataclasses.replace keeps."""
-
-    expression: ca.SX
-
-    @staticmethod
-    def at(expression: ca.SX, p: ca.SX, nominal: Array) -> Goal:
-        values = ca.Function("goal", [p], [expression])(nominal).full().ravel()
-        goal = values.view(Goal)
-        goal.expression = expression
-        goal.setflags(write=False)
-        return goal
-
-
-class Reference(np.ndarray[Any, np.dtype[np.float64]]):
-    """A point that stands where a goal would, of a problem without one; dataclasses.replace keeps it as none."""
-
-    @staticmethod
-    def at(point: Array) -> Reference:
-        reference = np.array(point, dtype=np.float64).view(Reference)
-        reference.setflags(write=False)
-        return reference
-
-
-def _goal_text(goal: Array) -> str:
-    """A goal as text: numbers, or expressions of p."""
-    expression = getattr(goal, "expression", None)
-    return short(goal) if expression is None else str(expression)
-
-
-def _symbolic(goal: Any, n: int, name: str, owner: str) -> Any:
-    """A user's goal as a CasADi column: numbers, or expressions of p."""
-    goal = _goal_column(goal)
-    if not isinstance(goal, ca.SX):
-        return ca.DM(checks.vector(goal, n, name, owner))
-    if goal.shape != (n, 1):
-        raise ValueError(f"{owner}: {name} has shape {list(goal.shape)}; expected [{n}], numbers or expressions of p")
-    return goal
-
-
-def _goal_column(goal: Any) -> Any:
-    """A list with expressions of p in it as one SX column, other things as they are."""
-    mixed = isinstance(goal, (list, tuple)) and any(isinstance(g, ca.SX) for g in goal)
-    return checks.column(goal) if mixed else goal
 
 
 def _quadratic(W: Array, e: ca.SX) -> ca.SX:

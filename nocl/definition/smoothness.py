@@ -15,10 +15,10 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from nocl import pretty
+from nocl.definition import pretty
+from nocl.definition.system import System
 from nocl.support import checks
 from nocl.support.checks import Array
-from nocl.system import System
 from nocl.translate.instructions import Instruction, instructions
 
 SAMPLES = 256  # points of the box

@@ -13,7 +13,7 @@ from typing import Any
 
 import casadi as ca
 
-from nocl.ocp import OCP
+from nocl.definition.ocp import OCP
 
 FACES = 4  # most controls that are coupled in H for all 3^nu faces to be written out
 

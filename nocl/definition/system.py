@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nocl import parameters, pretty
+from nocl.definition import parameters, pretty
 from nocl.support import checks
 from nocl.support.asked import answered
 from nocl.support.checks import MALFORMED, Array, Vector

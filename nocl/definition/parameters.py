@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 
-from nocl.sampling import Distribution, box
+from nocl.definition.sampling import Distribution, box
 from nocl.support import checks
 from nocl.support.checks import Array
 

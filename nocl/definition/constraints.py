@@ -22,9 +22,9 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from nocl.definition.system import System
 from nocl.support import checks
 from nocl.support.checks import Array
-from nocl.system import System
 from nocl.translate.arguments import Arguments
 
 SAMPLES = 4096  # of X x U

@@ -29,12 +29,12 @@ from typing import Any
 
 import casadi as ca
 
-from nocl.constraints import PATH, Measure, Rows
-from nocl.parameters import TIME, time
-from nocl.substeps import RADAU, RK4
+from nocl.definition.constraints import PATH, Measure, Rows
+from nocl.definition.parameters import TIME, time
+from nocl.definition.substeps import RADAU, RK4
+from nocl.definition.system import System
 from nocl.support import checks
 from nocl.support.checks import Array
-from nocl.system import System
 from nocl.translate import radau
 from nocl.translate.arguments import Arguments
 from nocl.translate.rk4 import rk4_cost

@@ -9,8 +9,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from nocl.ocp import OCP
-from nocl.sampling import own_numbers
+from nocl.definition.ocp import OCP
+from nocl.definition.sampling import own_numbers
 from nocl.support.checks import Array
 
 SAMPLES = 256
