@@ -124,7 +124,7 @@ def score(ocp: OCP, cnd: nocl.CND, n: int, sigma: float, seed: int = 12345) -> d
     gap = np.where(known, run.cost / best.cost - 1, -np.inf)
     row = {"failed": int((~run.success).sum()), "unsolved": int((~known).sum()),
            "J*": round(float(best.cost[known].mean()), 5), "gap": quantiles(gap[known]),
-           "terminal_error": round(float(run.terminal_error.mean()), 4),
+           "terminal_error": round(float(np.linalg.norm(ocp.from_goal(run.x[:, -1]), axis=1).mean()), 4),
            "control": round(float(run.control_magnitude.mean()), 3), "collisions": int((run.clearance < 0).sum()),
            "worst": [explained(ocp, x0[i], float(gap[i]), float(run.cost[i])) for i in np.argsort(-gap)[:3]]}
     slots = np.sort(rng.choice(np.arange(1, SLOTS - 1), 5, replace=False))

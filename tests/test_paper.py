@@ -260,5 +260,5 @@ def test_cartpole_swings_up():
     policy, *_ = train(ocp)
     run = judged(ocp, policy)
     assert run.success.all()
-    assert run.terminal_error.mean() < 0.5  # hanging: 3.1; the optimum: 0.037
+    assert np.linalg.norm(ocp.from_goal(run.x[:, -1]), axis=1).mean() < 0.5  # hanging: 3.1; the optimum: 0.037
     assert run.cost.mean() < 0.5  # hanging: 9.9; the optimum: 0.064

@@ -52,7 +52,7 @@ def test_a_run_to_an_image_of_the_goal_has_arrived():
     run = nocl.simulate(ocp, LQR(ocp), x0)
     np.testing.assert_allclose(run.cost, run.cost[0], rtol=1e-6)
     np.testing.assert_allclose(run.terminal_error, run.terminal_error[0], rtol=1e-4)
-    assert run.terminal_error.max() < 0.1
+    assert run.terminal_error.max() < 0.05
 
 
 def test_where_the_cost_is_not_periodic_nothing_changes():

@@ -43,7 +43,7 @@ def test_linear_feedback_is_exact():
     assert result.running_cost == pytest.approx(x0**2 * (1 - np.exp(-4)), abs=1e-8)
     assert result.terminal_cost == pytest.approx(5 * x0**2 * np.exp(-4), abs=1e-8)
     assert result.cost == pytest.approx(result.running_cost + result.terminal_cost)
-    assert result.terminal_error == pytest.approx(np.abs(x0) * np.exp(-2), abs=1e-8)
+    assert result.terminal_error == pytest.approx(np.abs(x0) / 3 * np.exp(-2), abs=1e-8)
     assert result.control_magnitude == pytest.approx(np.abs(x0) * (1 - np.exp(-2)) / 2, abs=1e-6)
     assert (result.saturation == 0).all()
     assert (result.clearance == np.inf).all()

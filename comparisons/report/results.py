@@ -295,7 +295,7 @@ COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("median gap %", "gap_median", "percent"), ("p95 gap %", "gap_p95", "percent"),
     ("missed %", "missed_median", "known"),
     ("within 1 %", "within_1", "share"), ("within 5 %", "within_5", "share"),
-    ("terminal error", "terminal_error", "spread"), ("mean |u|", "control_magnitude", "number"),
+    ("terminal error %", "terminal_error", "spread"), ("mean |u|", "control_magnitude", "number"),
     ("ms", "ms_per_solve", "number"),
     ("solves", "solves", "number"))
 NOTE = (
@@ -349,7 +349,7 @@ def _cell(row: Row, key: str, form: str) -> str:
         case "known":
             return "-" if math.isnan(row[key]) else percent(row[key])
         case "spread":
-            return f"{number(row[key + '_mean'])} ± {number(row[key + '_sd'])}"
+            return f"{number(100 * row[key + '_mean'])} ± {number(100 * row[key + '_sd'])}"
     return number(row[key])
 
 

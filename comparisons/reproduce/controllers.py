@@ -66,7 +66,7 @@ class Cell:
     seed: int
     key: dict[str, Any]  # what it was made with
     made: str  # in words; where there is no controller, why not
-    error: list[float]  # terminal error of each state, inf where the run failed; empty without a controller
+    error: list[float]  # ||x(T) - x*||_2 of each state, inf where the run failed; empty without a controller
     magnitude: list[float]  # mean over time of ||u||_2
     cost: list[float]
     seconds: float  # of training the controller, wall-clock; f_theta apart
@@ -139,7 +139,8 @@ def judged(cell: Cell, ocp: OCP, controller: Any, x0: Array) -> Cell:
     names = ocp.system.state_names
     place = [names.index(p) for p in POSITION] if set(POSITION) <= set(names) else []
     paths = np.round(s.x[:DRAWN, ::(INTERVALS // (NODES - 1)), place], 3).tolist() if place else []
-    return replace(cell, error=s.terminal_error.tolist(), magnitude=magnitude.tolist(), cost=s.cost.tolist(), ms=ms,
+    error = np.where(s.reached, np.linalg.norm(ocp.from_goal(s.x[:, -1]), axis=1), np.inf)
+    return replace(cell, error=error.tolist(), magnitude=magnitude.tolist(), cost=s.cost.tolist(), ms=ms,
                    paths=paths)
 
 

@@ -41,7 +41,8 @@ class Simulation:
     cost: Array  # [B], running + terminal, inf where the horizon was not reached
     running_cost: Array  # [B], integral of L, exact (no penalty)
     terminal_cost: Array  # [B], G(x(T))
-    terminal_error: Array  # [B], ||x(T) - x*||_2, x* the nearest image of the goal (OCP.from_goal); NaN without a goal
+    terminal_error: Array  # [B], max_i |x_i(T) - x*_i| as a share of half the width of X_i: states have units of
+    # their own; x* is the nearest image of the goal (OCP.from_goal); NaN without a goal
     control_magnitude: Array  # [B], mean of ||u||_2 over time
     saturation: Array  # [B], share of time with a control at a bound
     clearance: Array  # [B], min of all constraints, at and between nodes, and at the end, in units of their scales; of
@@ -247,7 +248,8 @@ class Judge:
         end = ocp.functions.end.columns(x=x[:, -1], p=self.p)
         terminal = np.where(reached, ocp.G(*end).full().ravel(), np.inf)
         running = np.where(reached, running, np.inf)
-        off = np.linalg.norm(ocp.from_goal(x[:, -1], self.p), axis=1) if ocp.has_goal else np.nan
+        half = (ocp.system.ubx - ocp.system.lbx) / 2
+        off = np.abs(ocp.from_goal(x[:, -1], self.p) / half).max(axis=1) if ocp.has_goal else np.nan
         error = np.where(reached, off, np.inf)
         u[~np.isfinite(x).all(axis=2)] = np.nan
         at_end = measured.least_at_end(ocp, x[:, -1], self.p)

@@ -125,7 +125,7 @@ function outcome(m) {
 const AUDITS = D.audits.map((audit) => ({...audit, values: floats(audit.values)}));
 const hasPath = NUMBERS.some((values) => values.some((v, k) => k % D.numbers.length === column("clearance") && Number.isFinite(v)));
 function drawOutcome() {
-  const head = ["method", "gap", "cost", "running", "terminal", "|x(T) - x*|", "at a bound", ...(hasPath ? ["clearance"] : []),
+  const head = ["method", "gap", "cost", "running", "terminal", "error at T, share of X", "at a bound", ...(hasPath ? ["clearance"] : []),
                 "ms, first", "ms, later"];
   const rows = D.methods.map((_, m) => "<tr>" + outcome(m).map((cell) => `<td>${cell}</td>`).join("") + "</tr>");
   $("outcome").innerHTML = `<table><thead><tr>${head.map((h) => `<th>${h}</th>`).join("")}</tr></thead><tbody>${rows.join("")}</tbody></table>`;
