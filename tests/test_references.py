@@ -3,10 +3,11 @@
 import casadi as ca
 import numpy as np
 import pytest
-from scipy.interpolate import CubicSpline
+import torch
+from scipy.interpolate import CubicSpline, RectBivariateSpline
 
 import nocl
-from nocl.solvers import DDP
+from nocl.solvers import DDP, NMPC
 
 
 @pytest.mark.parametrize("n", [2, 3, 4, 5, 12, 40])
@@ -32,6 +33,31 @@ def test_the_spline_is_scipys_and_linear_in_its_values(n):
 def test_what_a_spline_refuses(times, values, words):
     with pytest.raises(ValueError, match=words):
         nocl.spline(nocl.time(), times, values)
+
+
+def test_tables_of_one_and_two_variables_are_splines_that_all_layers_take():
+    """A grid of values as a spline of splines is scipy's bicubic one; f, torch and a solution have its values."""
+    a, b, grid = ca.SX.sym("a"), ca.SX.sym("b"), np.linspace(-1, 1, 9)
+    values = np.sin(2 * grid[:, None]) * np.cos(grid[None])
+    rows = [nocl.spline(b, grid, row) for row in values]
+    table = nocl.spline(a, grid, ca.vertcat(*rows))
+    at = np.random.default_rng(0).uniform(-1, 1, (50, 2))
+    f = ca.Function("f", [ca.vertcat(a, b)], [table, ca.gradient(table, ca.vertcat(a, b))])
+    truth, found = RectBivariateSpline(grid, grid, values), [v.full() for v in f(at.T)]
+    np.testing.assert_allclose(found[0][0], truth(*at.T, grid=False), atol=1e-9)
+    np.testing.assert_allclose(found[1][0], truth(*at.T, dx=1, grid=False), atol=1e-8)
+    np.testing.assert_allclose(found[1][1], truth(*at.T, dy=1, grid=False), atol=1e-8)
+    u = ca.SX.sym("u")
+    s = nocl.System("table", x=ca.vertcat(a, b), u=u, xdot=ca.vertcat(b, u - table), lbu=[-1], ubu=[1], lbx=[-1, -1],
+                    ubx=[1, 1])
+    torch_f = nocl.to_torch(s.f)(torch.from_numpy(at), torch.zeros(50, 1, dtype=torch.float64))
+    np.testing.assert_allclose(torch_f[:, 1].numpy(), -truth(*at.T, grid=False), atol=1e-9)
+    ocp = nocl.OCP.quadratic(s, horizon=2.0, x_goal=[0, 0], u_goal=[0],
+                             initial_states=nocl.Gaussian([0.5, 0.2], [0.1, 0.1]))
+    x0 = ocp.initial_states.sample(2, 0)
+    plan, other = DDP(ocp, intervals=20, substeps=1).solve(x0), NMPC(ocp, 20, substeps=1).solve(x0, progress=False)
+    assert plan.success.all()
+    np.testing.assert_allclose(plan.cost, other.cost, rtol=1e-7)
 
 
 def test_a_reference_of_samples_is_tracked_and_its_slope_by_each_sample_is_right():

@@ -61,6 +61,9 @@ def spline(t: Any, times: Any, values: Any) -> ca.SX:
 
     values : numbers, or SX expressions such as parameters, which it is linear in; t : nocl.time(), or any expression
 
+    In a state it is a table look-up, C^2; a table of two variables is a spline of splines: spline(x, xs, [spline(y, ys,
+    row) for row in values]).
+
     Its second derivative is continuous, the third one also at the second and the last but one of `times` (not-a-knot);
     before the first and after the last time the outermost cubic goes on. Raises ValueError for times that do not rise.
     """

@@ -39,7 +39,8 @@ def expand(function: ca.Function) -> ca.Function:
         except RuntimeError as error:
             reason = str(error).strip().splitlines()[-1]
             raise ValueError(f"{name} cannot be written in SX, expected elementary operations only: replace externals, "
-                             f"integrators, linear solvers and table look-ups in it ({reason})") from None
+                             "integrators, linear solvers (ca.solve in SX is one) and table look-ups (nocl.spline is "
+                             f"one) in it ({reason})") from None
     args = [ca.SX.sym(f"{function.name_in(i)}_", *function.size_in(i)) for i in range(function.n_in())]
     results = [ca.densify(r) for r in function.call(args)]
     return ca.Function(name, args, results, function.name_in(), function.name_out())
@@ -72,8 +73,8 @@ def check_scalar(function: ca.Function, owner: str) -> None:
     for i in instructions(function):
         if i.op not in UNARY | BINARY | {"OP_INPUT", "OP_CONST", "OP_OUTPUT"}:
             raise ValueError(f"{owner} contains {i.op}, a call of another function, expected operations on scalars "
-                             "only: put a polynomial, a sum of smooth bumps or a small network in place of a table "
-                             "look-up, and inline what is marked never_inline")
+                             "only: write a table look-up as nocl.spline(x, grid, values), two variables as splines of "
+                             "splines, and inline what is marked never_inline")
 
 
 def from_data(data: Mapping[str, Any], inputs: list[ca.SX] | None = None) -> ca.Function:

@@ -36,7 +36,7 @@ class TrainSettings(Scaled):
 
     # by how much more of each a problem with parameters takes, for each of them; MOST: as many parameters at most
     MORE: ClassVar[Mapping[str, float]] = {"seeds": 1 / 2, "states": 1 / 2, "tails": 1 / 8, "visits": 1 / 8,
-                                           "iterations": 1 / 16, "hidden": 1 / 16}
+                                           "rounds": 1 / 4, "iterations": 1 / 16, "hidden": 1 / 16}
     MOST: ClassVar[int] = 8
     BRANCHES: ClassVar[int] = 2  # with parameters: optima of other kinds are the rule then
 
@@ -44,8 +44,8 @@ class TrainSettings(Scaled):
     def of(cls, effort: str, *, parameters: int = 0, **changes: Any) -> TrainSettings:
         """The settings of an effort, "quick", "normal" or "best", with changes of single fields.
 
-        parameters : how many the problem has (OCP.np): the more, the more labels, the longer and wider the regression;
-            with any, BRANCHES
+        parameters : how many the problem has (OCP.np): the more, the more labels and rounds (as long as they
+            pay), the longer and wider the regression; with any, BRANCHES
         """
         n = min(checks.whole(parameters, "parameters", "TrainSettings.of", 0), cls.MOST)
         usual = asdict(super().of(effort))
