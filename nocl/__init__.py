@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from nocl.definition.constraints import Free, limit_rates
+from nocl.definition.constraints import INFINITE, Free, limit_rates
 from nocl.definition.ocp import OCP
 from nocl.definition.parameters import parameter, spline, time
 from nocl.definition.sampling import Gaussian, Uniform
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from nocl.translate.torch_functions import to_torch
 
 __version__ = "0.1.0"
-__all__ = ["CND", "OCP", "Dataset", "Ensemble", "Free", "Gaussian", "LearnedDynamics", "Log", "Solution", "System",
-           "Trajectory", "Uniform", "comparisons", "held_inputs", "identify", "limit_rates", "load_ocp", "parameter",
+__all__ = ["CND", "INFINITE", "OCP", "Dataset", "Ensemble", "Free", "Gaussian", "LearnedDynamics", "Log", "Solution",
+           "System", "Trajectory", "Uniform", "comparisons", "held_inputs", "identify", "limit_rates", "load_ocp", "parameter",
            "pretrained", "simulate", "smooth_abs", "smooth_max", "solvers", "spline", "split_controls", "systems",
            "time", "to_acados", "to_casadi", "to_control", "to_do_mpc", "to_gymnasium", "to_torch", "train"]
 

@@ -9,7 +9,8 @@ a Solution's gain is u_k + gain (x - x_k).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -28,6 +29,8 @@ from nocl.support.checks import Array
 DEGREE = 5  # of the spline through P(t)
 REFINE = 3  # spline nodes for each step of the Riccati integration
 ESCAPE = 1e12  # entries of P beyond this: the Riccati solution has escaped to infinity
+SEEN = 1e-9  # the least eigenvalue of P with a diagonal of 1, below which a motion costs nothing
+STILL = 1e-7  # of what changes in a unit of time: a mode that does not decay
 STATIONARY = 1e-8  # largest |f| and |gradient| at the goal pair, scaled, beyond which it is no equilibrium
 
 
@@ -46,7 +49,8 @@ class _LinearQuadratic:
 
 
 class LQR:
-    """u(x, t) = clip(u* - K(t) (x - x*), U) on a finite horizon, or with constant K where `infinite`.
+    """u(x, t) = clip(u* - K(t) (x - x*), U) on a finite horizon, or with constant K where it is `infinite`, as it always
+    is with nocl.INFINITE.
 
     Of one problem: with parameters, that at given ones, LQR(ocp.at(p=...)).
 
@@ -56,10 +60,10 @@ class LQR:
     """
 
     def __init__(self, ocp: OCP, infinite: bool = False) -> None:
-        checks.problem(ocp, "LQR")
-        infinite = checks.flag(infinite, "infinite", "LQR")
+        checks.problem(ocp, "LQR", infinite=True)
+        infinite = checks.flag(infinite, "infinite", "LQR") or ocp.is_infinite
         ocp.refuse_parameters("LQR")
-        ocp.refuse_constraints("LQR")
+        (ocp.lasting(1.0) if ocp.is_infinite else ocp).refuse_constraints("LQR")
         ocp.refuse_without_goal("LQR")
         self.ocp, self.infinite = ocp, infinite
         self.A, self.B = (j.full() for j in ocp.functions.jacobian(ocp.x_goal, ocp.u_goal))
@@ -106,10 +110,19 @@ class LQR:
         except LinAlgError:
             stable = False
         if not stable:
-            raise ValueError(f"LQR of {self.ocp.system.name!r}: no stabilising gain on an infinite horizon; expected "
-                             "(A, B) stabilisable at the goal and every slow mode in L: use the finite horizon, or "
-                             "a cost on the states in L")
+            raise ValueError(f"LQR of {self.ocp.system.name!r}: no stabilising gain on an infinite horizon"
+                             f"{self._lasting_modes()}; expected (A, B) stabilisable at the goal and every slow mode in "
+                             "L: use a finite horizon, or a cost on the states in L")
         return np.asarray(P * of.unit)
+
+    def _lasting_modes(self) -> str:
+        """The states that stay as they are, in words: of the modes of A that do not decay and that L does not see."""
+        rates, ways = np.linalg.eig(self._scaled.A)
+        unseen = [way for rate, way in zip(rates, ways.T, strict=True)
+                  if rate.real > -STILL and np.abs(self._scaled.Q @ way).max() < STILL * max(np.abs(way).max(), STILL)]
+        names = [name for i, name in enumerate(self.ocp.system.state_names)
+                 if any(abs(way[i]) > 0.3 * np.abs(way).max() for way in unseen)]
+        return f", since nothing is lost where {', '.join(names)} stays as it is" if names else ""
 
     @cached_property
     def _scaled(self) -> _LinearQuadratic:
@@ -171,6 +184,37 @@ class LQR:
         K = ca.mtimes(ca.DM(np.linalg.inv(self.R)), ca.mtimes(self.B.T, P) + self.S.T)
         u = self.ocp.u_goal - ca.mtimes(K, self.ocp.from_goal(at["x"]))
         return at.function("policy", {"u": ca.fmin(ca.fmax(u, s.lbu), s.ubu)})
+
+
+def ended(ocp: OCP, T: float) -> OCP:
+    """A problem of an infinite horizon for T alone, with LQR's cost to go at its end, d' P d / 2 about the goal. Of angles
+    that the problem is periodic in d^2 is 2 (1 - cos d) there and d z is sin(d) z: the same for all images.
+
+    Raises ValueError where LQR has no answer, or where its cost does not see a state: then to wait costs nothing.
+    """
+    lqr = LQR(ocp)
+    _check_seen(lqr)
+    d, P, more = ocp.functions.arguments["x"] - ca.DM(ocp.x_goal), lqr.P(), ca.SX(0)
+    for i in ocp.periodic:
+        more += P[i, i] * (1 - ca.cos(d[i])) ** 2  # (1 - cos)^2 + sin^2 = 2 (1 - cos)
+        d[i] = ca.sin(d[i])
+    with warnings.catch_warnings():  # of its kinks the problem itself has warned
+        warnings.simplefilter("ignore")
+        return replace(ocp, horizon=T, terminal=(ca.bilin(ca.DM(P), d, d) + more) / 2)
+
+
+def _check_seen(lqr: LQR) -> None:
+    """ValueError where V vanishes along a line through the goal."""
+    of, names = lqr._scaled, lqr.ocp.system.state_names
+    P = lqr.P() / of.unit
+    size, ways = np.linalg.eigh(P / np.sqrt(np.outer(np.diag(P), np.diag(P)).clip(1e-300)))
+    if size[0] > SEEN:
+        return
+    way = np.abs(ways[:, 0])
+    mode = ", ".join(name for name, part in zip(names, way, strict=True) if part > 0.3 * way.max())
+    raise ValueError(f"LQR of {lqr.ocp.system.name!r}: the cost does not see a motion of {mode}, so that to wait there "
+                     "costs nothing, for ever; expected a cost on the states: add one to L, like 0.1 times their squared "
+                     "distances from x*")
 
 
 def _hessians(ocp: OCP) -> tuple[Array, Array, Array, Array]:

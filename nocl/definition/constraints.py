@@ -86,6 +86,17 @@ class Free:
         return f"Free({self.low:g}, {self.high:g})"
 
 
+@dataclass(frozen=True)
+class Infinite:
+    """A horizon without an end: what runs for ever, and costs nothing at the goal."""
+
+    def __repr__(self) -> str:
+        return "INFINITE"
+
+
+INFINITE = Infinite()
+
+
 class Within(NamedTuple):
     """low <= expression <= high, +-inf for no bound; what OCP.constraints holds, and takes again."""
 

@@ -14,7 +14,19 @@ import numpy as np
 from nocl.definition import constraints as limits
 from nocl.definition import parameters as known
 from nocl.definition import pretty, sampling
-from nocl.definition.constraints import ALONG, BOUND, END, PATH, Constraint, Free, Places, Rows, Within
+from nocl.definition.constraints import (
+    ALONG,
+    BOUND,
+    END,
+    INFINITE,
+    PATH,
+    Constraint,
+    Free,
+    Infinite,
+    Places,
+    Rows,
+    Within,
+)
 from nocl.definition.functions import Functions
 from nocl.definition.goals import Goal, Reference, beside, column, joined, text
 from nocl.definition.sampling import Distribution, Gaussian, Seed, Uniform, box, short
@@ -31,6 +43,7 @@ KINKS = ("solvers that use second derivatives may fail there; smooth it, nocl.sm
 PLACES = 256  # initial states that constraints are measured at
 SAMPLES = 64  # initial states, and parameters, that a problem is tried at on construction
 ROUNDING = 1e-6  # of a scale: no violation
+REST = 1e-9  # of the width of X, and of a usual L: what stands still, and costs nothing
 FEW = 5  # parameters, beside the usual ones, that constraints are tried at
 N_IMAGES, SAME_IMAGE = 16, 1e-9  # points of the box; relative to usual values, images that agree so far are one
 
@@ -46,8 +59,9 @@ class OCP:
     Parameters
     ----------
     system : System
-    horizon : float or nocl.Free
-        T, in the system's unit of time (seconds for those that come with nocl); nocl.Free(low, high): T is to be found.
+    horizon : float, nocl.Free or nocl.INFINITE
+        T, in the system's unit of time (seconds for those that come with nocl); nocl.Free(low, high): T is to be found;
+        nocl.INFINITE: there is none, the goal pair is an equilibrium that costs nothing, and there is no G.
     running, terminal : casadi.SX
         L(x, u) and G(x), scalars in the system's own symbols; t in G is the horizon.
     x_goal, u_goal : [nx], [nu]
@@ -88,7 +102,7 @@ class OCP:
     system: System
     horizon: Any = field(kw_only=True)
     running: ca.SX = field(kw_only=True)
-    terminal: ca.SX = field(kw_only=True)
+    terminal: Any = field(default=None, kw_only=True)
     initial_states: Distribution = field(kw_only=True)
     x_goal: Any = field(default=None, kw_only=True)
     u_goal: Any = field(default=None, kw_only=True)
@@ -106,12 +120,13 @@ class OCP:
         checks.instance(System, self.system, "system", "OCP")
         s, owner = self.system, f"OCP on {self.system.name!r}"
         for name in ("horizon", "penalty", "penalty_margin"):
-            if not isinstance(getattr(self, name), Free):
+            if not isinstance(getattr(self, name), (Free, Infinite)):
                 self._set(**{name: checks.number(getattr(self, name), name, owner, positive=name == "horizon")})
         self._set(p=known.column(self.p, owner))
         check_unique((*s.names, *self.parameter_names), False, owner)
         t, p = known.time(), self._all_p
         self._check_constraints(owner)
+        self._set(terminal=self._end(owner))
         self._set(running=checks.expression(self.running, 1, ca.vertcat(s.x, s.u, p), "running", owner, time=t),
                   terminal=checks.expression(self.terminal, 1, ca.vertcat(s.x, p), "terminal", owner, s.u, time=t))
         self._check_parameters(owner)
@@ -121,6 +136,8 @@ class OCP:
             none = given is None or isinstance(given, Reference)
             self._set(**{name: Reference.at(instead) if none else self._goal(given, n, name, owner)})
         self._check_goal(owner)
+        if self.is_infinite:
+            self._check_for_ever(owner)
         self._check_finite(owner)
         self._check_possible(owner)
         if self.np:
@@ -171,9 +188,69 @@ class OCP:
         return isinstance(self.horizon, Free)
 
     @property
+    def is_infinite(self) -> bool:
+        """Whether there is no end."""
+        return isinstance(self.horizon, Infinite)
+
+    @property
     def longest(self) -> float:
-        """The horizon, or the longest that it may be."""
-        return float(self.horizon.high if self.is_free else self.horizon)
+        """The horizon, or the longest that it may be; of an infinite one, where time does not count, a unit of it."""
+        return 1.0 if self.is_infinite else float(self.horizon.high if self.is_free else self.horizon)
+
+    def lasting(self, duration: float) -> OCP:
+        """The problem of an infinite horizon for so long alone, without a cost of where it ends."""
+        if not self.is_infinite:
+            raise ValueError(f"OCP on {self.system.name!r}: lasting is for nocl.INFINITE, and the horizon is "
+                             f"{self.horizon!r}; expected dataclasses.replace(ocp, horizon={duration:g})")
+        with warnings.catch_warnings():  # of its kinks the problem itself has warned
+            warnings.simplefilter("ignore")
+            return replace(self, horizon=duration)
+
+    def _end(self, owner: str) -> Any:
+        """The terminal cost; there is none where there is no end."""
+        if self.terminal is None and not self.is_infinite:
+            raise ValueError(f"{owner}: terminal is missing; expected a cost of where a trajectory ends, an SX "
+                             "expression of x (terminal=0.0 for none), or horizon=nocl.INFINITE")
+        if not self.is_infinite:
+            return self.terminal
+        given = ca.SX(0) if self.terminal is None else self.terminal
+        if not isinstance(given, (int, float, ca.SX)) or not ca.SX(given).is_zero():
+            raise ValueError(f"{owner}: terminal is {checks.shown(given)}, and horizon is nocl.INFINITE, where nothing "
+                             "ends; expected none: leave it out, the cost of the last stretch is LQR's")
+        if self.terminal_constraints:
+            raise ValueError(f"{owner}: terminal_constraints are {', '.join(self.terminal_constraints)}, and horizon "
+                             "is nocl.INFINITE, where nothing ends; expected none: a law goes to the goal by itself")
+        return ca.SX(0)
+
+    def _check_for_ever(self, owner: str) -> None:
+        """What has no end must be an equilibrium that costs nothing, at all parameters."""
+        if self.uses_time:
+            raise ValueError(f"{owner}: it holds the time, and horizon is nocl.INFINITE; expected neither f nor L to: "
+                             "make the phase of what repeats itself two states, its sine and cosine")
+        if not self.has_goal:
+            raise ValueError(f"{owner}: horizon is nocl.INFINITE and there is no goal pair; expected x_goal and "
+                             "u_goal, an equilibrium that costs nothing")
+        p = np.vstack([self.nominal, self.sample_parameters(SAMPLES)])
+        x, u = self.goals(p)
+        of, s = self.functions, self.system
+        rows = of.arguments.columns(x=x, u=u, t=np.zeros(len(p)), p=p)
+        f = np.abs(of.f(*rows).full()) / (s.ubx - s.lbx)[:, None] if s.xdot is not None else np.zeros((1, 1))
+        if (f > REST).any():
+            k, i = np.unravel_index(int(f.argmax()), f.shape)
+            speed = f[k, i] * (s.ubx - s.lbx)[k]
+            raise ValueError(f"{owner}: at the goal pair {s.state_names[k]} moves by {speed:.4g} a unit of time"
+                             f"{self.at_p(p[i])}; expected an equilibrium, f(x*, u*) = 0: move the goal pair")
+        L = np.abs(of.L(*rows).full()[0])
+        if (REST * self._usual_cost() < L).any():
+            i = int(L.argmax())
+            raise ValueError(f"{owner}: the goal pair costs {L[i]:.4g} a unit of time{self.at_p(p[i])}, without an "
+                             "end; expected L = 0 there: subtract it, or move the goal pair")
+
+    def _usual_cost(self) -> float:
+        """Of L in X x U."""
+        places = self._samples(SAMPLES)
+        L = np.abs(self.functions.L(*self.functions.arguments.columns(**places)).full())
+        return float(np.median(L[np.isfinite(L)]))
 
     def _check_parameters(self, owner: str) -> None:
         d, names = self.parameters, self.parameter_names
@@ -474,7 +551,8 @@ class OCP:
                              f"ocp.without({', '.join(map(repr, beyond))})")
 
     def refuse_free(self, owner: str) -> None:
-        """ValueError for a free horizon."""
+        """ValueError for a free or an infinite horizon."""
+        checks.problem(self, owner)
         if self.is_free:
             raise ValueError(f"{owner} takes a number as horizon, but that of the problem on {self.system.name!r} is "
                              f"{self.horizon!r}: solve it by NMPC or DDP, or give it one, dataclasses.replace(ocp, "
@@ -673,7 +751,8 @@ class OCP:
         values = ca.vertcat(self.functions.running, self.functions.terminal,
                             *(self._at_end(one.expression) if one.kind == END else one.expression for one in held))
         (L, G, *constraints), shared = pretty.lines(values, z, prefix="c")
-        horizon = f"free in [{self.horizon.low:g}, {self.horizon.high:g}]" if self.is_free else f"{self.horizon:g}"
+        horizon = "infinite" if self.is_infinite else f"{self.longest:g}" if not self.is_free else \
+            f"free in [{self.horizon.low:g}, {self.horizon.high:g}]"
         lines = [f"OCP on {self.system.name!r}: horizon {horizon}"]
         lines += [pretty.wrapped("L", L), pretty.wrapped("G", G)]
         lines += [pretty.filled(f"{one.name}{' at the end' * (one.kind == END)}: {one.text(e)}")
@@ -688,7 +767,8 @@ class OCP:
 
     def to_data(self) -> dict[str, Any]:
         """The problem with its system as plain JSON data, exact to the last bit."""
-        horizon = {"free": [self.horizon.low, self.horizon.high]} if self.is_free else self.horizon
+        horizon = "infinite" if self.is_infinite else \
+            {"free": [self.horizon.low, self.horizon.high]} if self.is_free else self.horizon
         x_goal, u_goal = (None if isinstance(goal, Reference) else goal.tolist() for goal in (self.x_goal, self.u_goal))
         return {"system": self.system.to_data(), "horizon": horizon, "x_goal": x_goal, "u_goal": u_goal,
                 "initial_states": sampling.to_data(self.initial_states),
@@ -739,7 +819,8 @@ class OCP:
             horizon = data["horizon"]
             more = {kind: _constraints_from(data[kind], at) for kind in ("constraints", "terminal_constraints")
                     if kind in data}
-            horizon = Free(*horizon["free"]) if isinstance(horizon, Mapping) else horizon
+            horizon = Free(*horizon["free"]) if isinstance(horizon, Mapping) else \
+                INFINITE if horizon == "infinite" else horizon
             return OCP(system, horizon=horizon, x_goal=x_goal, u_goal=u_goal,
                        running=read(data["L"], at), terminal=read(data["G"], at), p=p,
                        parameters=sampling.from_data(data["parameters"]) if "parameters" in data else None,

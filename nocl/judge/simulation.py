@@ -38,7 +38,8 @@ Kicks = Sequence[tuple[float, ArrayLike]]
 
 def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: int | None = None, nodes: int = 81,
              kicks: Kicks | None = None, delay: float = 0.0, t0: float = 0.0, p: Any = None, rtol: float = 1e-9,
-             atol: float = 1e-10, tolerance: float = TOLERANCE, horizon: ArrayLike | None = None) -> Simulation:
+             atol: float = 1e-10, tolerance: float = TOLERANCE, horizon: ArrayLike | None = None,
+             duration: float | None = None) -> Simulation:
     """Run and score a controller on an OCP from states x0 [nx] or [B, nx].
 
     Parameters
@@ -55,14 +56,16 @@ def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: i
     t0 : start, so that a tail of the horizon can be judged
     tolerance : a run that violates a constraint by more than this share of its scale has failed
     horizon : of plans, where it is free (nocl.Free): a number, or [B]
+    duration : where the horizon is nocl.INFINITE: how long to run; the cost is that of this time alone
 
     Where the horizon is free, feedback runs until it arrives: until all terminal constraints hold within the tolerance.
     `hold` then counts parts of the longest horizon, `nodes` those of each run. One that does not arrive has failed.
 
     Raises ValueError for shapes that do not fit. A state that blows up or a NaN control is a row with success False.
     """
-    checks.problem(ocp, "simulate")
+    checks.problem(ocp, "simulate", infinite=True)
     check_made_for(ocp, controller, "the controller")
+    ocp = _lasting(ocp, duration)
     rows, _ = checks.states(x0, ocp.system.nx, ocp.system.name)
     t0 = _check_options(ocp, hold, nodes, t0)
     for name, value in (("rtol", rtol), ("atol", atol)):
@@ -90,6 +93,16 @@ def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: i
         ask, K = _feedback(ocp, controller, policy, values), hold or nodes - 1
         _check_delay(delay, (ocp.horizon - t0) / K, f"feedback that is sampled {K} times: sample it less often")
     return judge.held(ask, rows, np.linspace(t0, ocp.horizon, K + 1), jumps, delay)
+
+
+def _lasting(ocp: OCP, duration: float | None) -> OCP:
+    """The problem that a run is judged on: of an infinite horizon a part."""
+    if ocp.is_infinite:
+        return ocp.lasting(checks.number(duration, "duration", "simulate (the horizon is INFINITE)", positive=True))
+    if duration is not None:
+        raise ValueError(f"simulate: duration is {checks.shown(duration)}; expected none where the horizon is not "
+                         "nocl.INFINITE")
+    return ocp
 
 
 def _check_options(ocp: OCP, hold: int | None, nodes: int, t0: float) -> float:

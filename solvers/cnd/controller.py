@@ -54,7 +54,7 @@ class CND:
 
     def __init__(self, ocp: OCP, policy: FeatureNet, value: FeatureNet | None = None,
                  card: Mapping[str, Any] | None = None) -> None:
-        checks.problem(ocp, "CND")
+        checks.problem(ocp, "CND", infinite=True)
         checks.instance(FeatureNet, policy, "policy", "CND", "as nocl.train makes it")
         if value is not None:
             checks.instance(FeatureNet, value, "value", "CND", "as nocl.train makes it, or None")

@@ -36,6 +36,7 @@ from nocl.nets import FeatureNet
 from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.held import Held
 from nocl.solvers.cnd.laws import LawTraining, check_law
+from nocl.solvers.cnd.stationary import StationaryTraining, check_stationary
 from nocl.solvers.cnd.paper import PaperSettings, train_paper
 from nocl.solvers.cnd.plan import KICKED, PAYS, VALUE_HELD_OUT, Plan, measured, missed_by, stalled
 from nocl.solvers.cnd.plan import iterations as planned_iterations
@@ -128,6 +129,7 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
     _check(ocp, dynamics, seed, out)
     checks.word(method, ("default", "paper"), "method", "train")
     if method == "paper":
+        checks.problem(ocp, "train with method='paper'")
         if minutes is not None:
             raise ValueError("train: minutes are for the default method; 'paper' has PaperSettings(patience=...) and "
                              "iterations: leave them out")
@@ -143,6 +145,9 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
     usual = TrainSettings.of("normal", parameters=ocp.np)
     chosen = usual if settings is None else _expect(settings, TrainSettings)
     chosen = chosen if minutes is None else replace(chosen, minutes=minutes)
+    if ocp.is_infinite:
+        check_stationary(ocp, dynamics, chosen)
+        return StationaryTraining(ocp, chosen, seed, progress, own).run()
     if ocp.is_free:
         check_law(ocp, dynamics, chosen)
         return LawTraining(ocp, chosen, seed, progress, own).run()
@@ -154,6 +159,7 @@ def estimate(ocp: OCP, settings: TrainSettings, seed: int = 0) -> str:
 
     Raises ValueError for problems that training refuses.
     """
+    checks.problem(ocp, "an estimate of training")
     ocp.refuse_free("an estimate of training")
     with one_thread(), within(False):
         run = Training(ocp, None, settings, seed, None, False)
