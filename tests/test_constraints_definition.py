@@ -258,7 +258,7 @@ def refusal_of(taker, ocp):
 
 
 def test_a_free_horizon_has_no_loop_of_nmpc():
-    with pytest.raises(ValueError, match=r"^NMPC.controller takes a number as horizon, but .*replace\(ocp, horizon=4\)"):
+    with pytest.raises(ValueError, match=r"^NMPC.controller takes a number as horizon.*replace\(ocp, horizon=4\)"):
         NMPC(make(horizon=Free(0.5, 4)), 4).controller()
 
 
