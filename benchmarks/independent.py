@@ -26,11 +26,12 @@ LOOKS = 2000  # times of a run at which constraints are looked at
 PARTS = 40  # of the longest horizon, after each of which a run is asked whether it has arrived
 ALLOWED = 1e-3  # of a constraint's scale
 DEFECT = 1e-4  # of a state's range along a plan, by which it may miss its next node
+ARRIVES = 1e-3  # ... and its last one, to be followed in one go
+MARGIN = 0.05  # of a scale, the most that collocation stays away from a constraint to hold it between its points
 POINTS = 3  # of a collocation interval
 FAR = 1e3  # times X, where a run has blown up
 
 Array = np.ndarray
-Control = Callable[[float], Array]
 Rows = tuple[list[str], ca.Function, Array, Array]  # names; values as shares of scales, of (x, u, t, p); low, high
 
 
@@ -57,27 +58,38 @@ class Run:
 
 @dataclass(frozen=True)
 class Plan:
-    """Nodes of one solution and its controls: held on each interval, or the parabola through three points of it."""
+    """Nodes of one solution and its controls: held on each interval, or the parabola through its three points."""
 
     t: Array  # [K+1]
     x: Array  # [K+1, nx]
     u: Array  # [K, nu], or [K, POINTS, nu]
 
-    def control(self, k: int, low: Array, high: Array) -> Control:
-        """On interval k."""
+    def powers(self, k: int) -> Array:
+        """u(s) = sum_i powers[i] s^i [POINTS, nu], on interval k, at a share s of it."""
         if self.u.ndim == 2:
-            return lambda t: self.u[k]
-        begin, length = self.t[k], self.t[k + 1] - self.t[k]
-        return lambda t: np.clip(parabola((t - begin) / length) @ self.u[k], low, high)
+            return np.vstack([self.u[k:k + 1], np.zeros((POINTS - 1, self.u.shape[1]))])
+        return np.linalg.solve(np.vander(TAU, increasing=True), self.u[k])
 
 
 TAU = np.array(ca.collocation_points(POINTS, "radau"))
 
 
-def parabola(share: float) -> Array:
-    """The weights of three points' values, at a share of the interval [POINTS]."""
-    return np.array([np.prod([(share - TAU[i]) / (TAU[j] - TAU[i]) for i in range(POINTS) if i != j])
-                     for j in range(POINTS)])
+class Quick:
+    """A CasADi function of dense arguments without the way through matrices; its answer as [n]."""
+
+    def __init__(self, f: ca.Function) -> None:
+        self.buffer, self.evaluate = f.buffer()
+        self.given = [np.zeros(f.nnz_in(i)) for i in range(f.n_in())]
+        self.answer = np.zeros(f.nnz_out(0))
+        for i, values in enumerate(self.given):
+            self.buffer.set_arg(i, memoryview(values))
+        self.buffer.set_res(0, memoryview(self.answer))
+
+    def __call__(self, *values: Any) -> Array:
+        for own, value in zip(self.given, values, strict=True):
+            own[:] = value
+        self.evaluate()
+        return self.answer.copy()
 
 
 class Equations:
@@ -123,9 +135,20 @@ class Equations:
     def G(self, x: Array, t: float) -> float:
         return float(self.terminal(x, t, self.p))
 
-    def slope(self, law: Callable[[Array, float], Array]) -> Callable[[float, Array], Array]:
-        """d/dt of (x, cost) under u = law(x, t)."""
-        return lambda t, z: self.rate(z[:-1], law(z[:-1], t), t, self.p).full().ravel()
+    @cached_property
+    def control(self) -> ca.Function:
+        """(powers [POINTS, nu], s) -> u, clipped to U."""
+        powers, s = ca.SX.sym("powers", POINTS, len(self.low)), ca.SX.sym("s")
+        u = powers.T @ ca.vertcat(*(s**i for i in range(POINTS)))
+        return ca.Function("control", [powers, s], [ca.fmin(ca.fmax(u, self.low), self.high)])
+
+    @cached_property
+    def replay(self) -> Quick:
+        """(x, t, powers, begin, length) -> d/dt of (x, cost) under a plan's control."""
+        x, t, begin, length = self.symbols[0], ca.SX.sym("t"), ca.SX.sym("begin"), ca.SX.sym("length")
+        powers = ca.SX.sym("powers", POINTS, len(self.low))
+        rate = self.rate(x, self.control(powers, (t - begin) / length), t, ca.DM(self.p))
+        return Quick(ca.Function("replay", [x, t, powers, begin, length], [ca.densify(rate)]))
 
     def lsoda(self, slope: Callable[[float, Array], Array], z: Array, begin: float, end: float, times: Array) -> Any:
         """scipy's answer at `times`; what is not finite ends it."""
@@ -152,19 +175,19 @@ class Judge(Equations):
         """In closed loop from x0 [nx] to the horizon; where that is free, to where it arrives."""
         law = self.law(policy)
         x, t = ca.MX.sym("x", len(x0)), ca.MX.sym("t")
-        closed = ca.Function("closed", [x, t], [self.rate(x, law(x, t), t, self.p)])
+        closed = Quick(ca.Function("closed", [x, t], [ca.densify(self.rate(x, law(x, t), t, self.p))]))
         end, seen_t, seen_z = self.ocp.longest, [np.zeros(1)], [np.r_[x0, 0.0][None]]
         parts = PARTS if self.ocp.is_free else 1
         for part in range(parts):
             begin, until = end * part / parts, end * (part + 1) / parts
             times = np.linspace(begin, until, LOOKS // parts + 1)
-            answer = self.lsoda(lambda t, z: closed(z[:-1], t).full().ravel(), seen_z[-1][-1], begin, until, times)
+            answer = self.lsoda(lambda t, z: closed(z[:-1], t), seen_z[-1][-1], begin, until, times)
             if answer.status != 0 or not np.isfinite(answer.y).all():
                 return Run(why=f"it does not get beyond t = {answer.t[-1] if len(answer.t) else begin:.4g}")
             seen_t.append(answer.t[1:])
             seen_z.append(answer.y.T[1:])
-            if self.ocp.is_free and (k := self._arrival(np.concatenate(seen_t), np.vstack(seen_z))) is not None:
-                return self._ended(law, np.concatenate(seen_t)[:k + 1], np.vstack(seen_z)[:k + 1])
+            if self.ocp.is_free and (run := self._arrived(np.concatenate(seen_t), np.vstack(seen_z))) is not None:
+                return self._ended(law, *run)
         if self.ocp.is_free:
             nearest = self._missing(np.vstack(seen_z), np.concatenate(seen_t))
             return Run(why=f"it does not arrive within {end:g}: {nearest}")
@@ -179,20 +202,19 @@ class Judge(Equations):
         _, name = self._end(z[k:k + 1], t[k:k + 1])
         return f"nearest at t = {t[k]:.4g}, where {name!r} is off by {over[k]:.2g} scales"
 
-    def _arrival(self, t: Array, z: Array) -> int | None:
-        """The first moment at which all ends hold; between two looks the run is a straight line, or passes by."""
+    def _arrived(self, t: Array, z: Array) -> tuple[Array, Array] | None:
+        """The run up to the first moment at which all ends hold; between two looks it is a straight line."""
         over = np.where(t >= self.ocp.horizon.low, self._end(z, t)[0], np.inf)
         if (over <= ALLOWED).any():
-            return int(np.flatnonzero(over <= ALLOWED)[0])
+            k = int(np.flatnonzero(over <= ALLOWED)[0])
+            return t[:k + 1], z[:k + 1]
         near = np.flatnonzero((over[1:-1] <= over[:-2]) & (over[1:-1] <= over[2:]) & np.isfinite(over[:-2])) + 1
         for k in near:
-            def between(at: float, k: int = k) -> float:
-                state = np.array([[np.interp(at, t, column) for column in z.T]])
-                return float(self._end(state, np.array([at]))[0][0])
-
-            found = minimize_scalar(between, bounds=(t[k - 1], t[k + 1]), method="bounded")
+            found = minimize_scalar(lambda at: self._end(_line(at, t, z), np.array([at]))[0][0],
+                                    bounds=(t[k - 1], t[k + 1]), method="bounded")
             if found.fun <= ALLOWED:
-                return int(k)
+                before = t < found.x
+                return np.r_[t[before], found.x], np.vstack([z[before], _line(found.x, t, z)])
         return None
 
     def _ended(self, law: ca.Function, t: Array, z: Array) -> Run:
@@ -204,37 +226,54 @@ class Judge(Equations):
     def _judged(self, t: Array, x: Array, u: Array, paid: float) -> Run:
         """A run that got to its end, by all that is held along it and there."""
         along, name = self.over(self.along, x, u, t)
-        # where a run is ended within the tolerance by arriving, or at its horizon
         end, last = self._end(np.c_[x[-1:], [[0.0]]], t[-1:])
-        if self.ocp.is_free:
-            end = np.minimum(end, ALLOWED) if end[0] <= 10 * ALLOWED else end
         worst = max(float(along.max()), float(end[0]))
         return Run(paid + self.G(x[-1], float(t[-1])), worst, last if end[0] >= along.max() else name, "", t, x, u)
 
     def plan(self, plan: Plan) -> Run:
         """Its controls from its initial state on; where that is no such plan, from each of its nodes to the next."""
         whole = self._followed(plan, anew=False)
-        return whole if whole.holds else min(whole, self._followed(plan, anew=True), key=lambda run: not run.holds)
+        if whole.holds and np.max(np.abs(whole.x[-1] - plan.x[-1]) / _range(plan)) <= ARRIVES:
+            return whole
+        runs = [whole, self._followed(plan, anew=True)]
+        return min(runs, key=lambda run: (not run.holds, run.cost if run.holds else run.violation))
 
     def _followed(self, plan: Plan, anew: bool) -> Run:
         K, z = len(plan.t) - 1, np.r_[plan.x[0], 0.0]
-        size = np.ptp(plan.x, axis=0) + 1e-3 * np.abs(plan.x).max(axis=0) + 1e-12
         seen: list[tuple[Array, Array, Array]] = []
         for k in range(K):
-            control = plan.control(k, self.low, self.high)
-            times = np.linspace(plan.t[k], plan.t[k + 1], max(LOOKS // (4 * K), 4) + 1)
-            times[-1] = plan.t[k + 1]
-            answer = self.lsoda(self.slope(lambda x, t, of=control: of(t)), z, times[0], times[-1], times)
+            begin, length = plan.t[k], plan.t[k + 1] - plan.t[k]
+            powers, times = plan.powers(k), np.linspace(begin, plan.t[k + 1], max(LOOKS // (4 * K), 4) + 1)
+            answer = self.lsoda(self._under(powers.ravel("F"), begin, length), z, times[0], times[-1], times)
             if answer.status != 0 or not np.isfinite(answer.y).all():
                 return Run(why=f"its controls do not get beyond t = {times[0]:.4g}")
-            seen.append((answer.t, answer.y.T[:, :-1], np.array([control(t) for t in answer.t])))
+            seen.append((answer.t, answer.y.T[:, :-1], self._controls(powers, times)))
             z = answer.y[:, -1]
-            missed = float(np.max(np.abs(z[:-1] - plan.x[k + 1]) / size))
+            missed = float(np.max(np.abs(z[:-1] - plan.x[k + 1]) / _range(plan)))
             if anew and missed > DEFECT:
                 return Run(why=f"it misses its node {k + 1} by {missed:.2g} of a state's range")
             z = np.r_[plan.x[k + 1], z[-1]] if anew else z
         t, x, u = (np.concatenate(parts) for parts in zip(*seen, strict=True))
         return self._judged(t, x, u, float(z[-1]))
+
+
+    def _under(self, powers: Array, begin: float, length: float) -> Callable[[float, Array], Array]:
+        return lambda t, z: self.replay(z[:-1], t, powers, begin, length)
+
+    def _controls(self, powers: Array, times: Array) -> Array:
+        """A plan's at many times of an interval [n, nu]."""
+        shares = (times - times[0]) / (times[-1] - times[0])
+        return np.clip(np.vander(shares, POINTS, increasing=True) @ powers, self.low, self.high)
+
+
+def _range(plan: Plan) -> Array:
+    """What each state goes through along a plan [nx]."""
+    return np.ptp(plan.x, axis=0) + 1e-3 * np.abs(plan.x).max(axis=0) + 1e-12
+
+
+def _line(at: float, t: Array, z: Array) -> Array:
+    """A run's state at one moment [1, nx + 1]."""
+    return np.array([[np.interp(at, t, column) for column in z.T]])
 
 
 @dataclass(frozen=True)
@@ -277,9 +316,14 @@ class Collocation:
         s, self.limit = self.ocp.system, seconds
         self.sx, self.su = of.size, np.maximum(np.maximum(np.abs(s.lbu), np.abs(s.ubu)), 1e-12)
         self.solver, self.low, self.high, self.low_g, self.high_g = self._program()
+        along = of.along
+        inside = np.where(along[2] < along[3], 1.0, 0.0)  # an equation has no margin
+        self.inside = np.r_[np.zeros(s.nx * POINTS * intervals), np.tile(inside, (POINTS + 1) * intervals),
+                            np.zeros(len(of.at_end[0]))]
 
     def _stage(self) -> ca.Function:
-        """(x_k, states [nx, 3], controls [nu, 3], t_k, h) -> residuals, cost, rows [m, 3]."""
+        """(x_k, states [nx, 3], controls [nu, 3], t_k, h) -> residuals, cost, rows [m, 4]: where the interval begins
+        those with controls count, too."""
         s, of = self.ocp.system, self.of
         C, _, B = ca.collocation_coeff(list(TAU))
         x, X, U = ca.SX.sym("x", s.nx), ca.SX.sym("X", s.nx, POINTS), ca.SX.sym("U", s.nu, POINTS)
@@ -287,7 +331,11 @@ class Collocation:
         at = [(X[:, j], U[:, j], t + float(TAU[j]) * h, ca.DM(of.p)) for j in range(POINTS)]
         rate = ca.horzcat(*(of.rate(*z) for z in at))
         residual = (ca.horzcat(x, X) @ C - h * rate[:-1, :]) / ca.DM(self.sx)
-        held = ca.horzcat(*(of.along[1](*z) for z in at))
+        first = U @ ca.DM(np.linalg.inv(np.vander(TAU, increasing=True))[0])
+        starts = of.along[1](x, first, t, of.p)
+        starts = ca.vertcat(*(e if ca.depends_on(e, U) else z for e, z in
+                              zip(ca.vertsplit(starts), ca.vertsplit(of.along[1](*at[0])), strict=True)))
+        held = ca.horzcat(starts, *(of.along[1](*z) for z in at))
         return ca.Function("stage", [x, X, U, t, h], [ca.vec(residual), h * (rate[-1, :] @ B), ca.vec(held)])
 
     def _program(self) -> tuple[ca.Function, Array, Array, Array, Array]:
@@ -308,20 +356,21 @@ class Collocation:
         low, high = (np.r_[sign * free, np.tile(limit / self.su, POINTS * N), at_T] for sign, limit, at_T in
                      ((-1, s.lbu, bounds_T[0]), (1, s.ubu, bounds_T[1])))
         along, at_end = self.of.along, self.of.at_end
-        low_g, high_g = (np.r_[np.zeros(m), np.tile(along[side], POINTS * N), at_end[side]] for side in (2, 3))
+        low_g, high_g = (np.r_[np.zeros(m), np.tile(along[side], (POINTS + 1) * N), at_end[side]] for side in (2, 3))
         options = {"ipopt.print_level": 0, "print_time": False, "ipopt.sb": "yes", "ipopt.max_iter": 1000,
                    "ipopt.tol": 1e-9, "ipopt.acceptable_tol": 1e-7, "ipopt.max_wall_time": self.limit,
                    "expand": s.nx <= 12, "error_on_fail": False}
         nlp = {"x": w, "p": x0, "f": cost, "g": g}
         return ca.nlpsol("collocation", "ipopt", nlp, options), low, high, low_g, high_g
 
-    def solve(self, x0: Array, guess: Guess) -> tuple[Plan | None, str]:
-        """The optimum near a guess, or None and IPOPT's word."""
+    def solve(self, x0: Array, guess: Guess, margin: float = 0.0) -> tuple[Plan | None, str]:
+        """The optimum near a guess, or None and IPOPT's word; margin: of constraints along the way, in scales."""
         s, N = self.ocp.system, self.N
         x, u = guess.at(((np.arange(N)[:, None] + TAU) / N).ravel())
         T = [guess.T] if self.ocp.is_free else []
         start = np.r_[(x / self.sx).ravel(), (np.clip(u, s.lbu, s.ubu) / self.su).ravel(), T]
-        answer = self.solver(x0=start, p=x0, lbx=self.low, ubx=self.high, lbg=self.low_g, ubg=self.high_g)
+        answer = self.solver(x0=start, p=x0, lbx=self.low, ubx=self.high, lbg=self.low_g + margin * self.inside,
+                             ubg=self.high_g - margin * self.inside)
         said = str(self.solver.stats()["return_status"])
         if said not in ("Solve_Succeeded", "Solved_To_Acceptable_Level"):
             return None, said
@@ -337,5 +386,8 @@ class Collocation:
         for guess in guesses:
             plan, said = self.solve(x0, guess)
             runs.append(Run(why=f"IPOPT: {said}") if plan is None else judge.plan(plan))
+            if plan is not None and ALLOWED < runs[-1].violation <= MARGIN:
+                plan, said = self.solve(x0, Guess.of_plan(plan), runs[-1].violation)
+                runs.append(Run(why=f"IPOPT: {said}") if plan is None else judge.plan(plan))
         holding = [run for run in runs if run.holds]
         return min(holding, key=lambda run: run.cost) if holding else runs[-1]
