@@ -47,7 +47,7 @@ import nocl
 from nocl.cli.commands import QUICK_PROOF
 from nocl.cli.run_folder import RunFolder
 from nocl.data import Solution
-from nocl.solvers import DDP, NMPC, solve_globally
+from nocl.solvers import CND, DDP, NMPC, solve_globally
 
 EXAMPLES = {path.stem: path for path in sorted((provenance.ROOT / "examples").glob("*.py"))}
 RESULTS = provenance.RESULTS / "strangers.json"
@@ -101,7 +101,8 @@ class Optimum:
         if self.ocp.is_free:
             return np.inf
         for u in (self.ocp.goals(self.judge.p[None])[1][0], s.lbu, (s.lbu + s.ubu) / 2, s.ubu):
-            run = self.judge.plan(Plan(np.array([0.0, self.ocp.longest]), np.array([x0, x0]), u[None]))
+            plan = Plan(np.array([0.0, self.ocp.longest]), np.array([x0, x0]), u[None])
+            run = self.judge.followed(plan, np.zeros((1, s.nu, s.nx)))
             costs += [run.cost] * run.holds
         return min(costs)
 
@@ -151,25 +152,25 @@ def shown(row: dict[str, Any]) -> str:
     return "\n".join([*lines, *(f"  warning: {text}" for text in row["warnings"])])
 
 
-def trained(ocp: nocl.OCP, args: argparse.Namespace, row: dict[str, Any]) -> Any:
-    """The controller by nocl's own route; what goes wrong, and how long it takes, stands in the row."""
-    begin, busy, wrong = time.perf_counter(), _cpu(), row["wrong"]
+def trained(ocp: nocl.OCP, args: argparse.Namespace, row: dict[str, Any]) -> CND | None:
+    """The controller by nocl's own route, or None; what goes wrong, and how long it takes, stands in the row."""
+    begin, busy, wrong, cnd = time.perf_counter(), _cpu(), row["wrong"], None
     with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         stages = RunFolder(ocp, Path(folder), args.seed, args.effort, None if ocp.is_free else args.minutes)
         try:
             cnd = stages.train(exact=True)
-            row |= _taken(begin, busy)
+            row.update(_taken(begin, busy))
             stages.export(cnd, Path(folder) / "export", ("casadi", "c"), QUICK_PROOF)
         except Exception as error:
             wrong.append(f"{type(error).__name__}: {error}")
             traceback.print_exc()
-            cnd = locals().get("cnd")
-    if "wall minutes" not in row:
-        row |= _taken(begin, busy)
+    if cnd is None:
+        row.update(_taken(begin, busy))
     texts = sorted({str(one.message) for one in told if issubclass(one.category, UserWarning)})
-    wrong += [text for text in texts if not any(words in text for words in STEPS_TOLD)]
-    return cnd, [text for text in texts if text not in wrong]
+    row["told"] = [text for text in texts if any(words in text for words in STEPS_TOLD)]
+    wrong += [text for text in texts if text not in row["told"]]
+    return cnd
 
 
 def _cpu() -> float:
@@ -186,7 +187,7 @@ def judged(name: str, args: argparse.Namespace) -> dict[str, Any]:
     ocp = nocl.load_ocp(EXAMPLES[name])
     row: dict[str, Any] = {"problem": name, "states": ocp.system.nx, "controls": ocp.system.nu, "wrong": [],
                            "effort": args.effort, "minutes": args.minutes, "n": args.n, "commit": provenance.STARTED}
-    cnd, row["told"] = trained(ocp, args, row)
+    cnd = trained(ocp, args, row)
     if cnd is None:
         return row | {"clean": False}
     p = ocp.sample_parameters(args.n, args.seed + FRESH)
