@@ -28,6 +28,7 @@ LOOKS = 2000  # times of a run at which constraints are looked at
 PARTS = 40  # of the longest horizon, after each of which a run is asked whether it has arrived
 ALLOWED = 1e-3  # of a constraint's scale
 LAST = 1e3  # times the weight of a plan's other nodes that its last one has for the LQR about it
+ROOM = 1e-4  # of a scale, that collocation gives constraints along the way at the end
 MARGIN = 0.05  # of a scale, the most that collocation stays away from a constraint to hold it between its points
 POINTS = 3  # of a collocation interval
 FAR = 1e3  # times X, where a run has blown up
@@ -190,8 +191,8 @@ class Judge(Equations):
             begin, until = end * part / parts, end * (part + 1) / parts
             times = np.linspace(begin, until, LOOKS // parts + 1)
             answer = self.lsoda(lambda t, z: closed(z[:-1], t), seen_z[-1][-1], begin, until, times)
-            if answer.status != 0 or not np.isfinite(answer.y).all():
-                return Run(why=f"it does not get beyond t = {answer.t[-1] if len(answer.t) else begin:.4g}")
+            if not _whole(answer):
+                return Run(why=f"it does not get beyond t = {_reached(answer, begin):.4g}")
             seen_t.append(answer.t[1:])
             seen_z.append(answer.y.T[1:])
             if self.ocp.is_free and (run := self._arrived(np.concatenate(seen_t), np.vstack(seen_z))) is not None:
@@ -265,8 +266,8 @@ class Judge(Equations):
             powers, times = plan.powers(k), np.linspace(begin, plan.t[k + 1], max(LOOKS // (4 * K), 4) + 1)
             powers[0] += gains[k] @ (z[:-1] - plan.x[k])
             answer = self.lsoda(self._under(powers.ravel("F"), begin, length), z, times[0], times[-1], times)
-            if answer.status != 0 or not np.isfinite(answer.y).all():
-                return Run(why=f"its controls do not get beyond t = {times[0]:.4g}")
+            if not _whole(answer):
+                return Run(why=f"its controls do not get beyond t = {_reached(answer, begin):.4g}")
             seen.append((answer.t, answer.y.T[:, :-1], self._controls(powers, times)))
             z = answer.y[:, -1]
         t, x, u = (np.concatenate(parts) for parts in zip(*seen, strict=True))
@@ -280,6 +281,16 @@ class Judge(Equations):
         """A plan's at many times of an interval [n, nu]."""
         shares = (times - times[0]) / (times[-1] - times[0])
         return np.clip(np.vander(shares, POINTS, increasing=True) @ powers, self.low, self.high)
+
+
+def _whole(answer: Any) -> bool:
+    return bool(answer.status == 0 and np.isfinite(answer.y).all())
+
+
+def _reached(answer: Any, begin: float) -> float:
+    """The last time at which a run was finite."""
+    finite = np.isfinite(answer.y).all(axis=0) if len(answer.t) else np.zeros(0, dtype=bool)
+    return float(answer.t[finite][-1]) if finite.any() else begin
 
 
 def _range(plan: Plan) -> Array:
@@ -332,10 +343,13 @@ class Collocation:
         s, self.limit = self.ocp.system, seconds
         self.sx, self.su = of.size, np.maximum(np.maximum(np.abs(s.lbu), np.abs(s.ubu)), 1e-12)
         self.solver, self.low, self.high, self.low_g, self.high_g = self._program()
-        along = of.along
+        along, ends = of.along, len(of.at_end[0])
+        if ends:  # a bound at which the end is fixed leaves an interior-point method no room
+            last = slice(-ends - len(along[0]), -ends)
+            self.low_g[last], self.high_g[last] = self.low_g[last] - ROOM, self.high_g[last] + ROOM
         inside = np.where(along[2] < along[3], 1.0, 0.0)  # an equation has no margin
         self.inside = np.r_[np.zeros(s.nx * POINTS * intervals), np.tile(inside, (POINTS + 1) * intervals),
-                            np.zeros(len(of.at_end[0]))]
+                            np.zeros(ends)]
 
     def _stage(self) -> ca.Function:
         """(x_k, states [nx, 3], controls [nu, 3], t_k, h) -> residuals, cost, rows [m, 4]: where the interval begins

@@ -123,11 +123,11 @@ def best_of(runs: dict[str, Run]) -> tuple[str, float]:
 # One problem
 
 
-def check(name: str, seed: int) -> dict[str, Any]:
+def check(name: str, seed: int, starts: int) -> dict[str, Any]:
     """The costs of one initial state by three methods, each as LSODA has them, and what was wrong."""
     ocp, row = nocl.load_ocp(EXAMPLES[name]), {"problem": name}
     p, x0 = ocp.sample_parameters(1, seed)[0], ocp.initial_states.sample(1, seed)
-    begin, of = time.perf_counter(), Optimum(ocp, p, starts=4)
+    begin, of = time.perf_counter(), Optimum(ocp, p, starts)
     with warnings.catch_warnings(record=True) as told:
         warnings.simplefilter("always")
         plans = of.plans(x0)
@@ -321,7 +321,7 @@ def main() -> None:
         return print(table(kept()))
     if args.row is not None:
         (name,) = args.names
-        row = check(name, args.seed) if args.check else judged(name, args)
+        row = check(name, args.seed, args.starts) if args.check else judged(name, args)
         args.row.write_text(json.dumps(row))
         return None
     words = [word for word in sys.argv[1:] if word not in args.names]
