@@ -411,7 +411,7 @@ class Collocation:
         return Plan(np.linspace(0, length, N + 1), np.vstack([x0, X[POINTS - 1::POINTS]]), U), said
 
     def best(self, judge: Judge, x0: Array, guesses: Iterator[Guess] | list[Guess]) -> Run:
-        """The least cost that LSODA confirms, of all guesses."""
+        """The least cost that LSODA confirms, of all guesses; where there is none, what comes nearest."""
         runs = [Run(why="no guess")]
         for guess in guesses:
             plan, said = self.solve(x0, guess)
@@ -419,5 +419,4 @@ class Collocation:
             if plan is not None and ALLOWED < runs[-1].violation <= MARGIN:
                 plan, said = self.solve(x0, Guess.of_plan(plan), runs[-1].violation)
                 runs.append(Run(why=f"IPOPT: {said}") if plan is None else judge.plan(plan))
-        holding = [run for run in runs if run.holds]
-        return min(holding, key=lambda run: run.cost) if holding else runs[-1]
+        return min(reversed(runs), key=lambda run: (not run.holds, run.cost if run.holds else run.violation))
