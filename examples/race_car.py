@@ -32,7 +32,7 @@ system = nocl.System(
     "race_car", x=ca.vertcat(s, n, alpha, v, D, delta), u=ca.vertcat(D_rate, delta_rate),
     xdot=ca.vertcat(progress, v * ca.sin(alpha + C1 * delta), v * C2 * delta - curvature * progress,
                     a_along * ca.cos(C1 * delta), D_rate, delta_rate),
-    lbu=[-10, -2], ubu=[10, 2], lbx=[-2, -0.12, -0.8, 0, -1, -0.4], ubx=[4, 0.12, 0.8, 3, 1, 0.4],
+    lbu=[-10, -2], ubu=[10, 2], lbx=[-0.5, -0.12, -0.8, 0, -1, -0.4], ubx=[7, 0.12, 0.8, 5, 1, 0.4],
     units={"s": "m", "n": "m", "alpha": "rad", "v": "m/s", "delta": "rad", "D_rate": "1/s", "delta_rate": "rad/s"})
 
 ocp = nocl.OCP(
