@@ -29,7 +29,7 @@ PARTS = 40  # of the longest horizon, after each of which a run is asked whether
 ALLOWED = 1e-3  # of a constraint's scale
 LAST = 1e3  # times the weight of a plan's other nodes that its last one has for the LQR about it
 ROOM = 1e-4  # of a scale, that collocation gives constraints along the way at the end
-MARGIN = 0.05  # of a scale, the most that collocation stays away from a constraint to hold it between its points
+MARGIN = 0.2  # of a scale, the most that collocation stays away from a constraint to hold it between its points
 POINTS = 3  # of a collocation interval
 FAR = 1e3  # times X, where a run has blown up
 

@@ -76,8 +76,9 @@ class Optimum:
 
     def plans(self, x0: np.ndarray) -> dict[str, tuple[Solution | None, str]]:
         """Of NMPC and DDP, from all states x0 [n, nx]; None and what was raised."""
+        nmpc = NMPC(self.ocp, starts=self.starts, between=bool(self.ocp.held))
         methods = {
-            "NMPC": lambda: NMPC(self.ocp, starts=self.starts).solve(x0, workers=1, progress=False, **self.given),
+            "NMPC": lambda: nmpc.solve(x0, workers=1, progress=False, **self.given),
             "DDP": lambda: solve_globally(DDP(self.ocp), x0, starts=2 * self.starts, rounds=2, progress=False,
                                           **self.given)}
         return {name: _tried(method) for name, method in methods.items()}
