@@ -241,7 +241,7 @@ def in_a_process(name: str, words: list[str], limit: float) -> dict[str, Any]:
     """The row that a process of its own writes; one that is late is ended, and costs this row alone."""
     with tempfile.TemporaryDirectory() as folder:
         path, log = Path(folder) / "row.json", Path(folder) / "log"
-        command = [sys.executable, __file__, name, *words, "--row", str(path)]
+        command = [sys.executable, "-u", __file__, name, *words, "--row", str(path)]
         with log.open("w") as out:
             child = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, start_new_session=True)
             try:
