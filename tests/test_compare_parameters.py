@@ -58,7 +58,7 @@ def test_states_and_parameters_are_drawn_apart(ocp, report):
     assert (report.settings["initial states"], report.settings["parameters"]) == ("drawn with seed 3",) * 2
 
 
-def test_costs_are_riccatis_at_each_p(report):
+def test_costs_are_riccatis_at_each_p(ocp, report):
     best = optimum(report.x0, report.p)
     assert of(report, "LQR").cost == pytest.approx(best, rel=1e-7)
     assert set(report.best_method) == {"LQR"}

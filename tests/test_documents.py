@@ -16,7 +16,7 @@ import nocl
 from nocl.cli.commands import parser
 
 VIEW = ROOT / "tests/mission/users_view.py"
-SOURCES = [p for folder in ("nocl", "systems", "solvers", "comparisons", "benchmarks")
+SOURCES = [p for folder in ("nocl", "systems", "solvers", "comparisons", "benchmarks", "examples")
            for p in sorted((ROOT / folder).rglob("*.py"))]
 FILES = {".py", ".md", ".json", ".h", ".js", ".css", ".html", ".png", ".toml", ".yml"}
 MADE = {"runs", "build", "out", "cells", "tables", "figures", "export", "work", "report", "checkpoint"}  # by commands
