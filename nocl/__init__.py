@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = ["CND", "INFINITE", "OCP", "Dataset", "Ensemble", "Free", "Gaussian", "LearnedDynamics", "Log", "Solution",
-           "System", "Trajectory", "Uniform", "comparisons", "held_inputs", "identify", "limit_rates", "load_ocp", "parameter",
-           "pretrained", "simulate", "smooth_abs", "smooth_max", "solvers", "spline", "split_controls", "systems",
-           "time", "to_acados", "to_casadi", "to_control", "to_do_mpc", "to_gymnasium", "to_torch", "train"]
+           "System", "Trajectory", "Uniform", "comparisons", "held_inputs", "identify", "limit_rates", "load_ocp",
+           "parameter", "pretrained", "simulate", "smooth_abs", "smooth_max", "solvers", "spline", "split_controls",
+           "systems", "time", "to_acados", "to_casadi", "to_control", "to_do_mpc", "to_gymnasium", "to_torch", "train"]
 
 _LAZY = {  # public name -> module: torch and the solvers are imported when first used
     "CND": "nocl.solvers.cnd.controller", "train": "nocl.solvers.cnd.training",

@@ -49,8 +49,8 @@ class _LinearQuadratic:
 
 
 class LQR:
-    """u(x, t) = clip(u* - K(t) (x - x*), U) on a finite horizon, or with constant K where it is `infinite`, as it always
-    is with nocl.INFINITE.
+    """u(x, t) = clip(u* - K(t) (x - x*), U) on a finite horizon, or with constant K where it is `infinite`, as
+    nocl.INFINITE is.
 
     Of one problem: with parameters, that at given ones, LQR(ocp.at(p=...)).
 
@@ -111,8 +111,8 @@ class LQR:
             stable = False
         if not stable:
             raise ValueError(f"LQR of {self.ocp.system.name!r}: no stabilising gain on an infinite horizon"
-                             f"{self._lasting_modes()}; expected (A, B) stabilisable at the goal and every slow mode in "
-                             "L: use a finite horizon, or a cost on the states in L")
+                             f"{self._lasting_modes()}; expected (A, B) stabilisable at the goal and every slow mode "
+                             "in L: use a finite horizon, or a cost on the states in L")
         return np.asarray(P * of.unit)
 
     def _lasting_modes(self) -> str:
@@ -187,8 +187,8 @@ class LQR:
 
 
 def ended(ocp: OCP, T: float) -> OCP:
-    """A problem of an infinite horizon for T alone, with LQR's cost to go at its end, d' P d / 2 about the goal. Of angles
-    that the problem is periodic in d^2 is 2 (1 - cos d) there and d z is sin(d) z: the same for all images.
+    """A problem of an infinite horizon for T alone, with LQR's cost to go at its end, d' P d / 2 about the goal. Of
+    angles that the problem is periodic in d^2 is 2 (1 - cos d) there and d z is sin(d) z: all images are alike.
 
     Raises ValueError where LQR has no answer, or where its cost does not see a state: then to wait costs nothing.
     """
@@ -213,8 +213,8 @@ def _check_seen(lqr: LQR) -> None:
     way = np.abs(ways[:, 0])
     mode = ", ".join(name for name, part in zip(names, way, strict=True) if part > 0.3 * way.max())
     raise ValueError(f"LQR of {lqr.ocp.system.name!r}: the cost does not see a motion of {mode}, so that to wait there "
-                     "costs nothing, for ever; expected a cost on the states: add one to L, like 0.1 times their squared "
-                     "distances from x*")
+                     "costs nothing, for ever; expected a cost on the states: add one to L, like 0.1 times their "
+                     "squared distances from x*")
 
 
 def _hessians(ocp: OCP) -> tuple[Array, Array, Array, Array]:

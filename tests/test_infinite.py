@@ -30,8 +30,8 @@ def problem(system=SYSTEM, **options):
 
 
 def pendulum(running=None, **options):
-    swing = nocl.System("pendulum", x=ca.vertcat(p, v), u=u, xdot=ca.vertcat(v, 9.81 * ca.sin(p) + u), lbu=[-5], ubu=[5],
-                        lbx=[-7, -8], ubx=[7, 8], angles=["p"])
+    swing = nocl.System("pendulum", x=ca.vertcat(p, v), u=u, xdot=ca.vertcat(v, 9.81 * ca.sin(p) + u), lbu=[-5],
+                        ubu=[5], lbx=[-7, -8], ubx=[7, 8], angles=["p"])
     return problem(swing, running=2 * (1 - ca.cos(p)) + 0.1 * v**2 + 0.1 * u**2 if running is None else running,
                    initial_states=nocl.Gaussian([np.pi, 0], [0.3, 0.5]), **options)
 

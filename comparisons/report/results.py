@@ -125,7 +125,9 @@ class Results:
     @property
     def last(self) -> float:
         """The horizon; where it is free, when the last run ends."""
-        ends = np.concatenate([j.simulation.times[:, -1] for j in self.judged if self.ocp.is_free] or [[]])
+        if not self.ocp.is_free:
+            return self.ocp.longest
+        ends = np.concatenate([j.simulation.times[:, -1] for j in self.judged])
         return float(ends[np.isfinite(ends)].max(initial=0.0)) or self.ocp.longest
 
     @property

@@ -242,8 +242,8 @@ class OCP:
                              f"{self.at_p(p[i])}; expected an equilibrium, f(x*, u*) = 0: move the goal pair")
         L = np.abs(of.L(*rows).full()[0])
         if (REST * self._usual_cost() < L).any():
-            i = int(L.argmax())
-            raise ValueError(f"{owner}: the goal pair costs {L[i]:.4g} a unit of time{self.at_p(p[i])}, without an "
+            worst = int(L.argmax())
+            raise ValueError(f"{owner}: the goal pair costs {L[worst]:.4g} a unit of time{self.at_p(p[worst])}, with no "
                              "end; expected L = 0 there: subtract it, or move the goal pair")
 
     def _usual_cost(self) -> float:

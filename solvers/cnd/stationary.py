@@ -11,18 +11,19 @@ import math
 import time
 import warnings
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from nocl.data import Solution
 from nocl.definition.ocp import OCP
 from nocl.definition.sampling import own_numbers
 from nocl.definition.substeps import FINE
 from nocl.judge.simulation import simulate
-from nocl.nets import FeatureNet
+from nocl.nets import MLP, FeatureNet
 from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.laws import FAR, LawTraining, law_advice
 from nocl.solvers.cnd.regression.in_torch import InTorch
@@ -52,8 +53,8 @@ def check_stationary(ocp: OCP, dynamics: Any, settings: TrainSettings) -> None:
     """ValueError where a stationary law is not to be had."""
     name = ocp.system.name
     if dynamics is not None:
-        raise ValueError(f"train: the problem on {name!r} has an INFINITE horizon, and laws are trained on the exact f; "
-                         "expected no dynamics")
+        raise ValueError(f"train: the problem on {name!r} has an INFINITE horizon, and such laws are trained on the "
+                         "exact f; expected no dynamics")
     if ocp.constraint_names:
         raise ValueError(f"train: the problem on {name!r} has an INFINITE horizon and the constraints "
                          f"{', '.join(ocp.constraint_names)}; expected U alone: give it a number as horizon, or leave "
@@ -79,8 +80,8 @@ def accurate_level(ocp: OCP, lqr: LQR) -> float:
         if run.success.all() and (np.abs(run.cost / level - 1) < ACCURATE).all():
             return level
         level /= 2
-    raise ValueError(f"train: LQR of {s.name!r} does not cost what its own value says however near the goal; expected a "
-                     "goal pair with room to the bounds of U, and f smooth there")
+    raise ValueError(f"train: LQR of {s.name!r} does not cost what its own value says however near the goal; expected "
+                     "a goal pair with room to the bounds of U, and f smooth there")
 
 
 class StationaryTraining(LawTraining):
@@ -102,10 +103,10 @@ class StationaryTraining(LawTraining):
         self.loose = DDP(self.posed, intervals=4 * s.intervals, substeps=-(-substeps // 4))
         self.in_torch = InTorch(self.posed)
 
-    def _arrival(self, s: Solution) -> tuple[Array, Array]:
+    def _arrival(self, s: Solution) -> tuple[NDArray[np.bool_], Array]:
         """(whether they end where LQR is right, when they got below the level for good) [B]."""
         V = self._value(s.x)
-        outside = V > self.level
+        outside = self.level < V
         last = np.where(outside.any(axis=1), V.shape[1] - 1 - outside[:, ::-1].argmax(axis=1), 0)
         return s.success & (V[:, -1] < ENDED * self.level), s.t[np.arange(len(s)), last]
 
@@ -179,7 +180,7 @@ class StationaryTraining(LawTraining):
 
     def _exact(self, net: FeatureNet) -> FeatureNet:
         """The law with LQR's equilibrium and gain at the goal."""
-        at, ocp, y = Arguments.of(net.inputs), self.ocp, ca.SX.sym("y", net.nets[0].sizes[-1])
+        at, ocp, y = Arguments.of(net.inputs), self.ocp, ca.SX.sym("y", int(net.outputs.numel_in(net.inputs.n_in())))
         goal = torch.from_numpy(np.array(ocp.x_goal))[None]
         t = torch.zeros(1, 1, dtype=goal.dtype)
         u = net(goal, t)[0].detach().numpy()
@@ -191,7 +192,7 @@ class StationaryTraining(LawTraining):
         said = net.outputs(*at.inputs, y) + more
         s = ocp.system
         inside = ca.fmin(ca.fmax(said, ca.DM(s.lbu)), ca.DM(s.ubu))
-        exact = FeatureNet(net.inputs, list(net.nets), at.function("controls", {"u": inside}, y=y))
+        exact = FeatureNet(net.inputs, cast(list[MLP], list(net.nets)), at.function("controls", {"u": inside}, y=y))
         return exact.double().eval().requires_grad_(False)
 
     def _run(self) -> CND:

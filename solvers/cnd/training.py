@@ -36,7 +36,6 @@ from nocl.nets import FeatureNet
 from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.held import Held
 from nocl.solvers.cnd.laws import LawTraining, check_law
-from nocl.solvers.cnd.stationary import StationaryTraining, check_stationary
 from nocl.solvers.cnd.paper import PaperSettings, train_paper
 from nocl.solvers.cnd.plan import KICKED, PAYS, VALUE_HELD_OUT, Plan, measured, missed_by, stalled
 from nocl.solvers.cnd.plan import iterations as planned_iterations
@@ -55,6 +54,7 @@ from nocl.solvers.cnd.regression.labels import (
 )
 from nocl.solvers.cnd.regression.regress import fit_net, policy_loss
 from nocl.solvers.cnd.settings import TrainSettings, identity
+from nocl.solvers.cnd.stationary import StationaryTraining, check_stationary
 from nocl.solvers.cnd.validate import (
     advice,
     cannot_hold,

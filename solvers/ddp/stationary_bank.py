@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-
 import numpy as np
 
 from nocl.data import Solution
@@ -72,7 +71,7 @@ def pruned(ddp: DDP, s: Solution, lqr: LQR, level: float) -> Solution:
     end is worth little to them."""
     V = lqr.value(s.x.reshape(-1, s.x.shape[2])).reshape(s.x.shape[:2])
     total = s.V[:, :1] - s.V + V  # of LQR from each node on
-    total = np.where((V < level) & np.isfinite(total), total, np.inf)[:, :-1]
+    total = np.where((level > V) & np.isfinite(total), total, np.inf)[:, :-1]
     node = total.argmin(axis=1)
     found = np.flatnonzero(s.success & (total.min(axis=1) < s.cost * (1 - SAME)))
     if not len(found):
