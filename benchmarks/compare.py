@@ -74,8 +74,8 @@ def plain(value: Any) -> Any:
 def markdown(rows: list[dict[str, Any]]) -> str:
     """The table of all problems."""
     lines = ["| problem | method | failed | mean cost | median gap % | p95 gap % | within 1 % | within 5 % | "
-             "terminal error (share of X) | ms per answer |", "| --- |" + " --- |" * 9]
-    keys = ("cost_mean", "gap_median", "gap_p95", "within_1", "within_5", "terminal_error_mean", "ms_per_solve")
+             "ms per answer |", "| --- |" + " --- |" * 8]
+    keys = ("cost_mean", "gap_median", "gap_p95", "within_1", "within_5", "ms_per_solve")
     for one in rows:
         for s in one["summary"]:
             cells = [one["problem"], s["method"], f"{s['failures']} of {one['n']}", *(str(s[key]) for key in keys)]

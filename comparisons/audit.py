@@ -43,6 +43,7 @@ def audit(report: Report, methods: Mapping[str, Any], model: Any = None) -> tupl
     `to_casadi()`; without one the rollouts on it are missing. Where it has `doubt(x, u)` (learned dynamics, ensembles),
     what it says of the judged runs stands beside.
     """
+    report.ocp.refuse_free("audit")
     from nocl.support.threads import one_thread  # with torch
 
     learned = None if model is None else dynamics_function(report.ocp, model)

@@ -69,7 +69,8 @@ def compare(ocp: OCP, methods: Mapping[str, Any], n: int = 100, x0: ArrayLike | 
     solving = Solving(workers, folder, progress)
     judged = judged_runs(ocp, methods, states, rates, solving, most)
     solved = np.any([j.feasible for j in judged], axis=0)
-    why = impossible(ocp, states, solved, [j.simulation.u[:, :-1] for j in judged], most, solving)
+    why = impossible(ocp, states, solved, [j.simulation.u[:, :-1] for j in judged],
+                     [j.simulation.times[:, -1] for j in judged], most, solving)
     base = base_cost(ocp, states, most, solving)
     drawn = f"drawn with seed {seed}"
     settings: dict[str, Any] = {"seed": seed if x0 is None and p is None else None, "n": len(states),

@@ -267,7 +267,7 @@ def _unknown(s: Simulation) -> Judgement:
 def failed(ocp: OCP, message: Sequence[str], t: Array) -> Simulation:
     """What the judge says of states that there was nothing to run on; t [K]."""
     B, K = len(message), len(t)
-    t = np.tile(t, (B, 1)) if ocp.is_free else t
+    t = np.full((B, K), np.nan) if ocp.is_free else t
     inf, nan = np.full((4, B), np.inf), np.full((4, B), np.nan)
     x, u = (np.full((B, K, n), np.nan) for n in (ocp.system.nx, ocp.system.nu))
     return Simulation(t, x, u, inf[0], inf[1], inf[2], inf[3], nan[0], nan[1], nan[2], nan[3],

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nocl.comparisons.methods import Solving, Starts
+from nocl.comparisons.reference import held_guess
 from nocl.data import Solution
 from nocl.definition import measured
 from nocl.definition.ocp import OCP
@@ -24,12 +25,12 @@ INTERVALS = 80  # of the plans that are looked for
 STARTS = 8  # cold ones
 
 
-def impossible(ocp: OCP, starts: Starts, solved: NDArray[np.bool_], controls: Sequence[Array],
+def impossible(ocp: OCP, starts: Starts, solved: NDArray[np.bool_], controls: Sequence[Array], ends: Sequence[Array],
                tolerance: float, solving: Solving) -> tuple[str, ...]:
     """[B], why no plan holds the constraints from a state, "" where one does or nothing is known.
 
-    solved [B]: where a method held them; controls: those of the methods' runs [B, K, nu], NaN where there are none;
-    tolerance: of the constraints' scales.
+    solved [B]: where a method held them; controls: those of the methods' runs [B, K, nu], NaN where there are none,
+    and when these end [B]; tolerance: of the constraints' scales.
     """
     message, open_rows = [""] * len(starts), np.flatnonzero(~solved)
     if not open_rows.size or not ocp.constraint_names:
@@ -38,7 +39,7 @@ def impossible(ocp: OCP, starts: Starts, solved: NDArray[np.bool_], controls: Se
         message[i] = why
     left = np.array([i for i in open_rows if not message[i]], dtype=np.int64)
     if left.size:
-        said = _asked(ocp, starts[left], [u[left] for u in controls], tolerance, solving)
+        said = _asked(ocp, starts[left], [u[left] for u in controls], [T[left] for T in ends], tolerance, solving)
         for i, why in zip(left, said, strict=True):
             message[i] = why
     return tuple(message)
@@ -56,7 +57,8 @@ def _outside(ocp: OCP, starts: Starts, tolerance: float) -> list[str]:
     return said
 
 
-def _asked(ocp: OCP, starts: Starts, controls: Sequence[Array], tolerance: float, solving: Solving) -> list[str]:
+def _asked(ocp: OCP, starts: Starts, controls: Sequence[Array], ends: Sequence[Array], tolerance: float,
+           solving: Solving) -> list[str]:
     """What DDP says of states, by the plan of all that comes nearest to holding the constraints."""
     ddp, p = DDP(ocp, intervals=INTERVALS, between=False), starts.p if ocp.np else None
 
@@ -65,19 +67,17 @@ def _asked(ocp: OCP, starts: Starts, controls: Sequence[Array], tolerance: float
         return {"p": p, "workers": solving.workers, "out": out, "progress": solving.progress}
 
     plans = [solve_globally(ddp, starts.x, starts=STARTS, rounds=1, seed=0, **spread("cold"))]
-    goal = ocp.goals(starts.p)[1][:, None]
-    for number, u in enumerate(controls):
-        held = u[:, np.arange(INTERVALS) * u.shape[1] // INTERVALS]
-        guess = np.ascontiguousarray(np.where(np.isfinite(held), held, goal))
-        plans.append(ddp.solve(starts.x, u=guess, **spread(f"from-{number}")))
+    for number, (u, T) in enumerate(zip(controls, ends, strict=True)):
+        guess = held_guess(ocp, u, T, INTERVALS, p)
+        plans.append(ddp.solve(starts.x, **guess, **spread(f"from-{number}")))
     found = np.any([plan.success for plan in plans], axis=0)
     shares = np.array([_worst(ocp, plan) for plan in plans])  # [plans, B, K + 1, rows]
     return ["" if ok else _told(ocp, shares[:, i], tolerance) for i, ok in enumerate(found)]
 
 
 def _worst(ocp: OCP, plan: Solution) -> Array:
-    """By how much of its scale each row of OCP.shares is violated at each node [B, K+1, rows]; inf where the plan is
-    not finite."""
+    """By how much of its scale each row of `measured.shares` is violated at each node [B, K+1, rows]; inf where the
+    plan is not finite."""
     (B, nodes, nx), m = plan.x.shape, len(ocp.functions.rows)
     x, p = plan.x.reshape(-1, 1, nx), np.repeat(plan.parameters, nodes, axis=0)
     u = np.concatenate([plan.u, plan.u[:, -1:]], axis=1).reshape(B * nodes, 1, -1)

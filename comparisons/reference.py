@@ -16,6 +16,7 @@ from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
 
 NAME = results.REFERENCE
+EXACT = 1e-6  # DDP holds ends to hardly less than that
 INSIDE = 0.99  # of the tolerance, that plans end within: at its edge rounding decides
 SLOTS = 40  # kicks fall on multiples of the horizon over SLOTS
 
@@ -39,27 +40,29 @@ class Reference:
 
     def __init__(self, ocp: OCP, intervals: int, guesses: Sequence[Array] = (), ends: Sequence[Array] = (),
                  tolerance: float = TOLERANCE) -> None:
-        self.ocp = ocp.loosened(INSIDE * tolerance) if ocp.is_free else ocp
+        self.ocp = ocp.loosened(INSIDE * tolerance) if ocp.is_free and tolerance > EXACT else ocp
         self.intervals, self.guesses, self.ends = intervals, list(guesses), list(ends)
 
     def solve(self, x0: Array, p: Array | None = None) -> Solution:
         """The best solution of each state x0 [B, nx], p [B, np]; guesses are of the same."""
         ddp = DDP(self.ocp, intervals=self.intervals, between=True)
         best = ddp.solve(x0, p=p)
-        goal = self.ocp.goals(np.zeros((len(x0), 0)) if p is None else p)[1][:, None]
-        for guess, T in zip_longest(self.guesses, self.ends):
-            u = guess[:, np.arange(self.intervals) * guess.shape[1] // self.intervals]
-            u = np.ascontiguousarray(np.where(np.isfinite(u), u, goal))
-            best = better(best, ddp.solve(x0, u=u, t=self._nodes(T), p=p))
+        for u, T in zip_longest(self.guesses, self.ends):
+            best = better(best, ddp.solve(x0, p=p, **held_guess(self.ocp, u, T, self.intervals, p)))
         return best
 
-    def _nodes(self, T: Array | None) -> Array | None:
-        """The nodes [B, intervals + 1] of guesses that end then, where the horizon is free."""
-        if T is None:
-            return None
-        low, high = self.ocp.horizon.low, self.ocp.horizon.high
-        last = np.clip(np.where(np.isfinite(T), T, np.sqrt(low * high)), low, high)
-        return last[:, None] * np.linspace(0, 1, self.intervals + 1)
+
+def held_guess(ocp: OCP, u: Array, T: Array | None, intervals: int, p: Array | None) -> dict[str, Array]:
+    """What DDP.solve starts from: controls u [B, K, nu], u* for NaN, on so many intervals, until T [B] where the
+    horizon is free."""
+    held = u[:, np.arange(intervals) * u.shape[1] // intervals]
+    goal = ocp.goals(np.zeros((len(u), 0)) if p is None else p)[1][:, None]
+    guess = {"u": np.ascontiguousarray(np.where(np.isfinite(held), held, goal))}
+    if T is None or not ocp.is_free:
+        return guess
+    low, high = ocp.horizon.low, ocp.horizon.high
+    last = np.clip(np.where(np.isfinite(T), T, np.sqrt(low * high)), low, high)
+    return guess | {"t": last[:, None] * np.linspace(0, 1, intervals + 1)}
 
 
 def resolved(ocp: OCP, start: Solution, kicks: Sequence[tuple[int, Array]]) -> Array:

@@ -45,6 +45,7 @@ def stability(report: Report, methods: Mapping[str, Any]) -> tuple[Stability, ..
     that are made for each p are made anew, and trajectories have their own.
     """
     ocp = report.ocp
+    ocp.refuse_free("stability")
     laws = {name: law for name, method in methods.items() if (law := _law(ocp, method)) is not None}
     if "LQR" not in methods:
         laws |= _lqr(ocp)

@@ -74,22 +74,36 @@ def switching():
 
 @pytest.fixture(scope="module")
 def studied():
-    """The switching law and DDP's plans beside the reference."""
+    """The switching law, continuous and held, and DDP's plans beside the reference."""
     ocp = problem(scales={"at p": 1.0, "at v": 1.0})
-    return study(ocp, {"switching": switching(), "DDP": DDP(ocp)}, n=4, seed=5, tolerance=1e-2, progress=False)
+    return study(ocp, {"switching": switching(), "DDP": DDP(ocp)}, n=4, seed=5, hold=[None, 400], tolerance=1e-2,
+                 progress=False)
 
 
 def test_the_reference_ends_as_near_as_feedback_does(studied):
     """Not later than the least time to the goal itself, and by no more sooner than the goal is away from where it may
     end."""
     best, least = studied.judged[-1].simulation, least_time(studied.x0)
-    assert [j.name for j in studied.judged] == ["switching", "DDP", "reference"]
+    assert [j.name for j in studied.judged] == ["switching", "switching (400 holds)", "DDP", "reference"]
     assert best.success.all()
     assert (best.cost < least).all()
     corner = least_time(np.array([[0.01, 0.01]]))
     assert (best.cost > least - corner).all()
     assert (studied.gap[-1] <= 0.02).all()  # per cent: held controls against a law in continuous time
-    assert len(studied.promises) == 4  # two methods, within 2 % and on constraints
+    assert len(studied.promises) == 6  # three methods, within 2 % and on constraints
+
+
+def test_held_runs_have_all_their_nodes_before_they_arrive():
+    """Bang-bang: |u| = 1 all the time, although the law is held."""
+    ocp, x0 = problem(scales={"at p": 1.0, "at v": 1.0}), STATES.sample(3, 6)
+    run = nocl.simulate(ocp, switching(), x0, hold=400, tolerance=5e-2)
+    assert run.success.all()
+    assert run.t.shape == (3, 401)
+    assert (np.diff(run.t) > 0).all()
+    np.testing.assert_allclose(run.control_magnitude, 1.0, rtol=1e-3)
+    np.testing.assert_allclose(run.saturation, 1.0, rtol=1e-3)
+    v = x0[:, 1:] + np.cumsum(run.u[:, :-1, 0] * np.diff(run.t), axis=1)
+    np.testing.assert_allclose(run.x[:, 1:, 1], v, atol=1e-8)  # each control acts where it stands
 
 
 def test_the_page_has_each_run_on_its_own_times(studied, tmp_path):
@@ -129,9 +143,9 @@ def test_held_feedback_is_the_plan_of_its_answers():
     run = nocl.simulate(ocp, ask, [[0.0, -0.5]], hold=40, tolerance=1e-6)
     assert asked == [0.25 * k for k in range(len(asked))]
     assert run.t[0, -1] == pytest.approx(2.0, abs=1e-4)
-    assert (np.diff(run.t[0, :8]) == 0.25).all()
+    np.testing.assert_allclose(run.t[0], np.linspace(0, 2, 41), atol=1e-4)  # each of 8 intervals in 5 parts
     np.testing.assert_allclose(run.cost, 2.0, atol=1e-4)
-    np.testing.assert_allclose(run.x[0, 4], [-0.25, 0.0], atol=1e-8)
+    np.testing.assert_allclose(run.x[0, 20], [-0.25, 0.0], atol=1e-8)
 
 
 def test_what_does_not_arrive_says_by_how_much():

@@ -106,7 +106,7 @@ def _set_up(report: Results, i: int, chosen: Sequence[int], draw: Draw) -> tuple
         for m, move, plot in parts:
             s, held = report.judged[m].simulation, report.judged[m].held
             x, u = so_far(s.times[i], s.x[i], t), so_far(s.times[i], s.u[i], t, held)
-            artists += [*move(x, u[-1], t), *plot(s.times[i], u, t, held)]
+            artists += [*move(x, u[-1], min(t, s.times[i, -1])), *plot(s.times[i], u, t, held)]
         return artists
 
     return figure, frame

@@ -78,9 +78,10 @@ def _lost_where(report: Results, m: int, b: int, i: int) -> str:
     running = float(ours.running_cost[i] - best.running_cost[i])
     terminal = float(ours.terminal_cost[i] - best.terminal_cost[i])
     error = report.ocp.from_goal(ours.x[i, -1], report.parameters[i])
-    k = int(np.abs(error).argmax())
-    name = report.ocp.system.state_names[k]
-    unit = report.ocp.system.units.get(name, "")
+    s = report.ocp.system
+    k = int(np.abs(error / (s.ubx - s.lbx)).argmax())
+    name = s.state_names[k]
+    unit = s.units.get(name, "")
     miss = f"; at the end {name} is off by {number(float(error[k]))}{' ' + unit if unit else ''}" \
         if report.ocp.has_goal else ""
     where = "the terminal cost" if terminal > 2 * running else "the running cost" if running > 2 * terminal else \

@@ -105,8 +105,8 @@ def channels(report: Results) -> dict[str, int]:
 
 
 def valued(report: Results) -> Judged | None:
-    """The first method with a value function V(x, t[, p])."""
-    return next((j for j in report.judged if j.value is not None), None)
+    """The first method with a value function V(x, t[, p]); none where each run has times of its own."""
+    return None if report.ocp.is_free else next((j for j in report.judged if j.value is not None), None)
 
 
 def _index(report: Results, i: int) -> int:

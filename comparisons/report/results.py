@@ -304,7 +304,8 @@ NOTE = (
     "Judged on the exact f under CVODES. Gap: to the best known cost of the same initial state, over all methods here "
     "and simple baselines.",
     "ms: one evaluation of a controller, or one solve; a solver that tried several starts took so many solves a state.",
-    "Mean costs, error and |u| are over the runs that did not fail; predicted is what the method itself expected.")
+    "Mean costs, error and |u| are over the runs that did not fail; predicted is what the method itself expected.",
+    "Terminal error: the largest distance of a state from the goal, in per cent of half the width of that state's box.")
 VIOLATES = ("violates", "violates", "text")  # the column that stands where there is something in it
 
 
@@ -324,8 +325,11 @@ def notes(report: Results) -> list[str]:
     n, c = int(report.counted.sum()), report.counted
     if report.ocp.is_free:
         share = report.settings.get("tolerance", 0)
-        return [*NOTE, "Feedback ends as soon as all terminal constraints hold within the tolerance, a share of "
-                f"{share:g} of their scales; plans end where they hold exactly, and cost more."]
+        ends = [] if not report.ocp.held_at_end else [
+            "Feedback ends as soon as all terminal constraints hold within the tolerance, a share of "
+            f"{share:g} of their scales, and so does the reference; other plans end where they hold exactly, and cost "
+            "more: part of their gap is that."]
+        return [*NOTE, *ends]
     if report.base is None:
         return [*NOTE]
     known = int((c & np.isfinite(report.base)).sum())

@@ -243,8 +243,8 @@ class OCP:
         L = np.abs(of.L(*rows).full()[0])
         if (REST * self._usual_cost() < L).any():
             worst = int(L.argmax())
-            raise ValueError(f"{owner}: the goal pair costs {L[worst]:.4g} a unit of time{self.at_p(p[worst])}, with no "
-                             "end; expected L = 0 there: subtract it, or move the goal pair")
+            raise ValueError(f"{owner}: the goal pair costs {L[worst]:.4g} a unit of time{self.at_p(p[worst])}, for "
+                             "ever; expected L = 0 there: subtract it, or move the goal pair")
 
     def _usual_cost(self) -> float:
         """Of L in X x U."""

@@ -318,7 +318,7 @@ class System:
         """The system of f:(x [nx], u [nu]) -> xdot [nx]; options: name, states, controls (names), angles, units.
 
         f is written out in SX: elementary operations only (ValueError for externals, integrators, look-up tables:
-        nocl.spline is one).
+        write those by nocl.spline).
         Names of states and controls are x0, x1, ..., u0, ... by default.
         """
         return _from_casadi(f, lbu=lbu, ubu=ubu, lbx=lbx, ubx=ubx, **options)

@@ -13,6 +13,7 @@ from itertools import pairwise
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 from scipy.optimize import brentq, minimize_scalar
 
 from nocl.definition import measured
@@ -41,8 +42,8 @@ def arriving(judge: Judge, policy: ca.Function, x0: Array, nodes: int) -> Simula
 
 
 def arriving_held(judge: Judge, ask: Callable[[Array], Ask], x0: Array, K: int) -> Simulation:
-    """Feedback that is asked at K equal parts of the longest horizon, and held. What arrives earlier stays at its last
-    node for the rest.
+    """Feedback that is asked at K equal parts of the longest horizon, and held. Of what arrives earlier these parts are
+    cut into more, of one control each, so that all runs have K.
 
     ask : p [1, np] -> how it is asked
     """
@@ -52,8 +53,18 @@ def arriving_held(judge: Judge, ask: Callable[[Array], Ask], x0: Array, K: int) 
         alone = judge.of(i)
         law = _Held(alone, steps, ask(alone.p), K)
         T, why = _Run(alone, law, K).end(x)
-        runs.append(_unless(why, alone.held(_Plan(law.u), x[None], np.minimum(grid, T), [])))
+        t, of = _cut(grid, T)
+        runs.append(_unless(why, alone.held(_Plan(law.u[:, of]), x[None], t, [])))
     return _stacked(runs)
+
+
+def _cut(grid: Array, T: float) -> tuple[Array, NDArray[np.int64]]:
+    """(nodes [K+1] from 0 to T, those of the grid [K+1] before T among them; which of the grid's intervals each of the
+    K intervals is in)."""
+    K, m = len(grid) - 1, max(int(np.searchsorted(grid, T)), 1)
+    place = np.floor(np.linspace(0, K, m + 1) + 1e-9).astype(np.int64)
+    return (np.interp(np.arange(K + 1), place, np.minimum(grid[:m + 1], T)),
+            np.searchsorted(place, np.arange(K), side="right") - 1)
 
 
 class _Held:
@@ -178,7 +189,8 @@ def _unless(why: str, run: Simulation) -> Simulation:
     if not why or not run.reached[0]:
         return run
     lost, none = np.full(1, np.inf), np.zeros(1, dtype=bool)
-    return replace(run, cost=lost, running_cost=lost, terminal_cost=lost, success=none, reached=none, message=[why])
+    return replace(run, cost=lost, running_cost=lost, terminal_cost=lost, success=none, reached=none, message=[why],
+                   terminal_error=np.where(np.isnan(run.terminal_error), np.nan, np.inf))
 
 
 def _stacked(runs: list[Simulation]) -> Simulation:

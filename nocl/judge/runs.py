@@ -212,9 +212,10 @@ class Judge:
                 least = np.minimum(least, self.under(acts, start, path, a + (b - a) * np.r_[0.0, step.grid]))
         z[:, :nx] += sum(dx for time, dx in jumps if time == t[-1])
         x[:, -1], u[:, -1] = z[:, :nx], u[:, -2]
-        magnitude = np.linalg.norm(u[:, :-1], axis=2).mean(axis=1)
+        share = np.diff(t) / (t[-1] - t[0])
+        magnitude, saturation = np.linalg.norm(u[:, :-1], axis=2) @ share, self.at_bound(u[:, :-1]) @ share
         least = np.minimum(least, self.at_nodes(x, u, t))
-        return self.score(t, x, u, z[:, -1], magnitude, self.at_bound(u[:, :-1]).mean(axis=1), least, message)
+        return self.score(t, x, u, z[:, -1], magnitude, saturation, least, message)
 
     def under(self, u: Array, start: Array, path: Array, t: Array) -> Array:
         """Least values of the constraints on the way from `start` [B, 1, nx] along `path` [B, m, nx] under u [B, nu];
@@ -249,8 +250,8 @@ class Judge:
         terminal = np.where(reached, ocp.G(*end).full().ravel(), np.inf)
         running = np.where(reached, running, np.inf)
         half = (ocp.system.ubx - ocp.system.lbx) / 2
-        off = np.abs(ocp.from_goal(x[:, -1], self.p) / half).max(axis=1) if ocp.has_goal else np.nan
-        error = np.where(reached, off, np.inf)
+        off = np.abs(ocp.from_goal(x[:, -1], self.p) / half).max(axis=1)
+        error = np.where(reached, off, np.inf) if ocp.has_goal else np.full(len(x), np.nan)
         u[~np.isfinite(x).all(axis=2)] = np.nan
         at_end = measured.least_at_end(ocp, x[:, -1], self.p)
         violation, worst = measured.violation(ocp, least, at_end), self.worst(measured.shares(ocp, least, at_end))

@@ -39,8 +39,8 @@ def expand(function: ca.Function) -> ca.Function:
         except RuntimeError as error:
             reason = str(error).strip().splitlines()[-1]
             raise ValueError(f"{name} cannot be written in SX, expected elementary operations only: replace externals, "
-                             "integrators, linear solvers (ca.solve in SX is one) and table look-ups (nocl.spline is "
-                             f"one) in it ({reason})") from None
+                             "integrators, linear solvers (by ca.solve in SX) and table look-ups (by nocl.spline) in "
+                             f"it ({reason})") from None
     args = [ca.SX.sym(f"{function.name_in(i)}_", *function.size_in(i)) for i in range(function.n_in())]
     results = [ca.densify(r) for r in function.call(args)]
     return ca.Function(name, args, results, function.name_in(), function.name_out())

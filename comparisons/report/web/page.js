@@ -115,7 +115,7 @@ function drawMap() {
     yaxis: up === "gap" ? log("gap [%]") : axis({title: {text: LABELS[Number(up)]}}), showlegend: up === "gap" || traces.length > 2});
 }
 function outcome(m) {
-  const method = D.methods[m], failed = method.failed[state], cells = ["cost", "running", "terminal", "error"].map((name) => text(number(m, state, name)));
+  const method = D.methods[m], failed = method.failed[state], cells = ["cost", "running", "terminal"].map((name) => text(number(m, state, name))).concat(text(100 * number(m, state, "error")));
   const clearance = number(m, state, "clearance");
   return [`<span class=swatch style="border-color:${colour(m)}"></span>${MNAMES[m]}`,
           failed !== undefined ? safe(failed) : "+" + percent(gap(m, state)),
@@ -125,7 +125,7 @@ function outcome(m) {
 const AUDITS = D.audits.map((audit) => ({...audit, values: floats(audit.values)}));
 const hasPath = NUMBERS.some((values) => values.some((v, k) => k % D.numbers.length === column("clearance") && Number.isFinite(v)));
 function drawOutcome() {
-  const head = ["method", "gap", "cost", "running", "terminal", "error at T, share of X", "at a bound", ...(hasPath ? ["clearance"] : []),
+  const head = ["method", "gap", "cost", "running", "terminal", "error at T, %", "at a bound", ...(hasPath ? ["clearance"] : []),
                 "ms, first", "ms, later"];
   const rows = D.methods.map((_, m) => "<tr>" + outcome(m).map((cell) => `<td>${cell}</td>`).join("") + "</tr>");
   $("outcome").innerHTML = `<table><thead><tr>${head.map((h) => `<th>${h}</th>`).join("")}</tr></thead><tbody>${rows.join("")}</tbody></table>`;
