@@ -285,6 +285,7 @@ def test_a_problem_in_time_is_compared():
     np.testing.assert_allclose(report.audits[0].rollouts[0].cost, report.cost[0], rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_disturbances_at_p_are_those_of_the_problem_there(ocp):
     """Noise, kicks, delays, wrong plants and the optima under them, of what knows p and of what is made at each p."""
     p, x0, settings = np.array([0.85, 0.6]), np.array([[0.3, -0.2]]), Disturbances(hold=20, fastest=20)

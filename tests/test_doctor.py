@@ -118,11 +118,13 @@ def test_an_opinion_that_is_not_there(monkeypatch):
     assert "NMPC solves none of 2 states: given" in said(cart())[1]["second opinion"].text
 
 
+@pytest.mark.slow
 def test_time_scales_that_are_far_apart_are_no_lack_of_control():
     _, by = said(cart((1e-4 * V, 1e5 * (U - V)), horizon=1e4, running=1e-5 * U**2), intervals=10)
     assert by["controllability"].verdict == OK
 
 
+@pytest.mark.slow
 def test_a_coarse_grid_is_seen_where_constraints_are_held():
     _, by = said(cart((V, 600 * (U - V)), terminal=X**2, state_bounds={"v": (-0.9, 0.9)}))
     assert by["integration"].verdict == REMARK

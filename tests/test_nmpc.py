@@ -109,6 +109,7 @@ def test_several_starts_find_what_one_misses():
     assert ((many.hits >= 1) & (many.hits <= many.starts)).all()
 
 
+@pytest.mark.slow
 def test_neighbours_only_improve():
     ocp = nocl.load_ocp("dubins")
     x0 = ocp.initial_states.sample(24, 3)  # of which some are left in a worse optimum

@@ -53,6 +53,7 @@ def test_a_controller_sees_them_and_is_saved_and_exported(tmp_path):
     np.testing.assert_allclose(cnd.value_to_casadi()(x0.T, 0.3).full().ravel(), cnd.value(x0, 0.3), rtol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_a_checkpoint_with_other_features_is_left_aside(tmp_path):
     ocp = nocl.load_ocp("double_integrator")

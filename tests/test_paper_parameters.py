@@ -85,6 +85,7 @@ def test_it_trains_and_learns_each_goal(tmp_path):
     np.testing.assert_array_equal(again(x0, 0.5, p), cnd(x0, 0.5, p))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_learned_dynamics_and_checkpoints(tmp_path):
     ocp = mover()

@@ -178,7 +178,8 @@ def test_a_root_that_is_none_is_not_a_number():
 
 
 @pytest.mark.parametrize("make", [lambda ocp, **given: DDP(ocp, **given),
-                                  lambda ocp, **given: NMPC(ocp, 80, starts=2, passes=0, **given)])
+                                  pytest.param(lambda ocp, **given: NMPC(ocp, 80, starts=2, passes=0, **given),
+                                               marks=pytest.mark.slow)])
 def test_they_are_chosen_where_explicit_ones_are_too_many_and_that_is_said(make):
     ocp = stiff.linear(1e5)
     x0 = ocp.initial_states.sample(2, 0)
