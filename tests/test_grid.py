@@ -112,8 +112,8 @@ def test_left_to_themselves_solvers_take_as_many_as_the_plant_asks_for(make, rat
 
 
 @pytest.mark.parametrize("make", [lambda ocp, **given: DDP(ocp, intervals=20, **given),
-                                  pytest.param(lambda ocp, **given: NMPC(ocp, 20, starts=3, passes=0, time_limit=5.0, **given),
-                                               marks=pytest.mark.slow)])
+                                  pytest.param(lambda ocp, **given: NMPC(ocp, 20, starts=3, passes=0, time_limit=5.0,
+                                                                         **given), marks=pytest.mark.slow)])
 def test_a_plan_that_steps_over_a_singularity_is_not_solved(make):
     x0 = np.array([[0.5, 0.5], [0.8, 0.2]])
     shared_program.cache_clear()
