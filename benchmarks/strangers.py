@@ -6,8 +6,7 @@
     python benchmarks/strangers.py --table                 # the rows that are kept, in markdown
 
 Each file of examples/ goes the way of `nocl run FILE --exact`: it is loaded, a controller is trained on the exact f,
-and exported (what has a free horizon, which `nocl run` does not take, as by `nocl train --exact`, without a limit of
-minutes).
+and exported (where the horizon is free, without a limit of minutes).
 Then benchmarks/independent.py judges it, which uses neither solvers nor judge of nocl: closed loop under LSODA from
 fresh initial states, beside the best of NMPC's plan, DDP's and Radau collocation's that LSODA confirms.
 

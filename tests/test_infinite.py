@@ -108,6 +108,7 @@ def test_plans_that_wait_at_the_goal_are_pruned():
     ddp = DDP(posed, intervals=60)
     ways = ddp.solve(np.tile([[0.1, 0.0]], (3, 1)), u=np.stack([np.full((60, 1), level) for level in (0.0, 4.0, -4.0)]))
     better = pruned(ddp, ways, lqr, accurate_level(ocp, lqr))
+    assert (ways.cost > 2 * lqr.value([0.1, 0.0])).any()  # some go astray
     assert (better.cost <= ways.cost * (1 + 1e-9)).all()
     np.testing.assert_allclose(better.cost[ways.success], lqr.value([0.1, 0.0]), rtol=0.02)
 

@@ -6,6 +6,7 @@ import casadi as ca
 import numpy as np
 import pytest
 
+import nocl
 from nocl import load_ocp
 from nocl.systems import NAMES
 from nocl.translate.instructions import BINARY, UNARY
@@ -61,3 +62,19 @@ def test_axes_broadcast_and_misfits_are_refused():
         to_jax(ca.Function("f", [x], [x @ x.T]))
     with pytest.raises(ValueError, match="expected a casadi"):
         to_jax(lambda x: x)
+
+
+def test_parameters_and_time_are_inputs_like_the_others():
+    """f, L, G and h of (x, u, t, p), each of what it holds."""
+    x, u, t = ca.SX.sym("x", 2), ca.SX.sym("u"), nocl.time()
+    mass, goal = nocl.parameter("mass", 1.0), nocl.parameter("goal", 0.0)
+    s = nocl.System("cart", x=x, u=u, p=mass, xdot=ca.vertcat(x[1], u / mass - ca.sin(t) * x[0]), lbu=[-1], ubu=[1],
+                    lbx=[-3, -3], ubx=[3, 3])
+    ocp = nocl.OCP(s, p=goal, horizon=2.0, running=u**2 + (x[0] - goal * ca.cos(t)) ** 2, terminal=(x[0] - goal) ** 2,
+                   x_goal=ca.vertcat(goal, 0), u_goal=[0], initial_states=nocl.Gaussian([0, 0], [0.1, 0.1]),
+                   parameters=nocl.Uniform([0.5, -1], [2, 1]), path_constraints={"wall": goal + 4 - x[0] + t})
+    rng, of = np.random.default_rng(0), ocp.functions
+    at = {"x": rng.uniform(-1, 1, (20, 2)), "u": rng.uniform(-1, 1, (20, 1)), "t": rng.uniform(0, 2, 20),
+          "p": ocp.sample_parameters(20)}
+    for function, arguments in ((of.f, of.arguments), (of.L, of.arguments), (of.h, of.node), (of.G, of.end)):
+        same_as_casadi(function, *(np.asarray(c).T for c in arguments.columns(**at)))

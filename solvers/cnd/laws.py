@@ -26,6 +26,7 @@ from nocl.definition.ocp import OCP
 from nocl.definition.sampling import own_numbers
 from nocl.definition.substeps import FINE
 from nocl.judge.simulation import simulate
+from nocl.nets import FeatureNet
 from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.regression.features import net_on, without_clock
 from nocl.solvers.cnd.regression.in_torch import InTorch
@@ -156,7 +157,11 @@ class LawTraining:
         if (remark := law_advice(self._best(), s.held_out)) is not None:
             warnings.warn(f"{self.ocp.system.name}: {remark}", stacklevel=4)
         self.seconds = time.perf_counter() - begin
-        return CND(self.ocp, self.net, None, self._card())
+        return CND(self.ocp, self._finished(), None, self._card())
+
+    def _finished(self) -> FeatureNet:
+        """The law as it is handed out."""
+        return self.net
 
     def _first_labels(self) -> None:
         s, rng = self.settings, own_numbers(self.seed, 0)

@@ -8,8 +8,6 @@ u = net(x) + exp(-V_lqr / c) (du + dK (x - x*)).
 from __future__ import annotations
 
 import math
-import time
-import warnings
 from dataclasses import replace
 from typing import Any, cast
 
@@ -24,8 +22,7 @@ from nocl.definition.sampling import own_numbers
 from nocl.definition.substeps import FINE
 from nocl.judge.simulation import simulate
 from nocl.nets import MLP, FeatureNet
-from nocl.solvers.cnd.controller import CND
-from nocl.solvers.cnd.laws import FAR, LawTraining, law_advice
+from nocl.solvers.cnd.laws import FAR, LawTraining
 from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.cnd.regression.labels import Labels, Problems, continuous_run
 from nocl.solvers.cnd.settings import TrainSettings
@@ -42,6 +39,7 @@ ACCURATE = 0.05  # LQR costs what V_lqr says to within this
 TRIED = 64  # states of an ellipsoid, that this is tried from
 HALVINGS = 20  # of the level at which LQR's controls leave U, at most
 ENDED = 0.05  # of the level: where solutions have to end
+THERE = 1e-3  # of the level: states so near the goal are not asked for
 FIRST = 6.0  # time constants of the slowest mode under LQR, the first T
 LATER = 1.3  # times when the last solution gets there
 GROWN, GROWTHS = 1.5, 8  # T, where some do not; so often at most
@@ -138,16 +136,13 @@ class StationaryTraining(LawTraining):
             bar.update()
             if s.states:
                 further = Problems.initial(self.ocp, s.states, rng)
-                self.bank = self.bank.add(self._solved(further.x, further.p))
+                self.bank = self.bank.add(self.bank.solve(self.ddp, further.x, further.p))
             self.bank = self.bank.cleaned(self.ddp, 4)
             bar.update()
             self.labels = self._labels(self.bank.solution)
             if s.tails:
-                self._learn(self._solved(*self.bank.around(s.tails, s.width, rng)))
+                self._learn(self.bank.solve(self.ddp, *self.bank.around(s.tails, s.width, rng)))
             bar.update()
-
-    def _solved(self, x: Array, p: Array) -> Solution:
-        return self.bank.solve(self.ddp, x, p)
 
     def _labels(self, solution: Solution) -> Labels:
         """Of solutions that arrive, all of their nodes; errors count against what is still to pay."""
@@ -160,7 +155,7 @@ class StationaryTraining(LawTraining):
     def _under_way(self, states: Array, p: Array) -> Array:
         """[B, steps+1], whether states are not yet at the goal, and not far out of X."""
         far = FAR * np.maximum(np.abs(self.ocp.system.lbx), np.abs(self.ocp.system.ubx))
-        return (self._value(states) > 1e-3 * self.level) & (np.abs(states) < far).all(axis=2)
+        return (self._value(states) > THERE * self.level) & (np.abs(states) < far).all(axis=2)
 
     def _validate(self) -> None:
         """The gap of runs over T, with V_lqr where they end, to the optimum."""
@@ -168,7 +163,7 @@ class StationaryTraining(LawTraining):
         with self._stage("held-out states", 1) as bar:
             fresh = Problems.initial(self.ocp, s.held_out, rng)
             best = self.bank.solve(self.loose, fresh.x, fresh.p, 4)
-            law = self._exact(self.net)
+            law = self._finished()
             J, x, _ = continuous_run(law, self.in_torch, fresh, 4 * s.intervals)
             own = self.loose.solve(fresh.x, u=_held(law, x), progress=False)
             best = better(best, pruned(self.loose, own, self.lqr, self.level))
@@ -178,9 +173,10 @@ class StationaryTraining(LawTraining):
         self.history.append({"round": self.round, "labels": len(self.labels), "unsolved": int((~best.success).sum()),
                              "arrived": float(arrived.mean()), **summary(gap, "gap")})
 
-    def _exact(self, net: FeatureNet) -> FeatureNet:
+    def _finished(self) -> FeatureNet:
         """The law with LQR's equilibrium and gain at the goal."""
-        at, ocp, y = Arguments.of(net.inputs), self.ocp, ca.SX.sym("y", int(net.outputs.numel_in(net.inputs.n_in())))
+        net, ocp = self.net, self.ocp
+        at, y = Arguments.of(net.inputs), ca.SX.sym("y", int(net.outputs.numel_in(net.inputs.n_in())))
         goal = torch.from_numpy(np.array(ocp.x_goal))[None]
         t = torch.zeros(1, 1, dtype=goal.dtype)
         u = net(goal, t)[0].detach().numpy()
@@ -194,23 +190,6 @@ class StationaryTraining(LawTraining):
         inside = ca.fmin(ca.fmax(said, ca.DM(s.lbu)), ca.DM(s.ubu))
         exact = FeatureNet(net.inputs, cast(list[MLP], list(net.nets)), at.function("controls", {"u": inside}, y=y))
         return exact.double().eval().requires_grad_(False)
-
-    def _run(self) -> CND:
-        s, begin = self.settings, time.perf_counter()
-        self._first_labels()
-        self._network()
-        while self.round <= s.rounds and not self._good_enough():
-            if self.round:
-                self._visit()
-            self._regress(s.iterations * (2 if self.round >= max(s.least_rounds, 1) else 1))
-            self._validate()
-            self._keep_best()
-            self.round += 1
-        self.net.load_state_dict(self.weights)
-        if (remark := law_advice(self._best(), s.held_out)) is not None:
-            warnings.warn(f"{self.ocp.system.name}: {remark}", stacklevel=4)
-        self.seconds = time.perf_counter() - begin
-        return CND(self.ocp, self._exact(self.net), None, self._card())
 
 
 def _held(law: FeatureNet, x: Array) -> Array:

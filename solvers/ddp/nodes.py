@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import cached_property, reduce
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +30,13 @@ class NodeBank:
             raise ValueError(f"no solution of {ocp.system.name!r} was found: {solution.message[0]}")
         self.scale = self.solution.x.std(axis=(0, 1)) + 1e-9 * (ocp.system.ubx - ocp.system.lbx)
 
-    def add(self, solution: Solution) -> NodeBank:
+    def add(self, solution: Solution) -> Self:
         """With further solutions."""
-        return NodeBank(self.ocp, type(solution).join([self.solution, solution]))
+        return self.holding(type(solution).join([self.solution, solution]))
+
+    def holding(self, solution: Solution) -> Self:
+        """The same of other solutions."""
+        return type(self)(self.ocp, solution)
 
     @cached_property
     def _tree(self) -> KDTree:

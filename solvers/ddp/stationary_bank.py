@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Self
+
 import numpy as np
 
 from nocl.data import Solution
@@ -11,6 +13,9 @@ from nocl.solvers.ddp.nodes import NodeBank, Rows
 from nocl.solvers.ddp.solver import DDP
 from nocl.solvers.lqr import LQR
 from nocl.support.checks import Array
+
+SAME = 1e-4  # of a cost: less is no other optimum
+RARE = 0.01  # of solutions, that get better: few enough
 
 
 class StationaryBank(NodeBank):
@@ -24,9 +29,9 @@ class StationaryBank(NodeBank):
         self.lqr, self.level = lqr, level
         super().__init__(ocp, solution)
 
-    def add(self, solution: Solution) -> StationaryBank:
-        """With further solutions."""
-        return StationaryBank(self.ocp, type(solution).join([self.solution, solution]), self.lqr, self.level)
+    def holding(self, solution: Solution) -> Self:
+        """The same of other solutions."""
+        return type(self)(self.ocp, solution, self.lqr, self.level)
 
     def tails(self, rows: Rows, nodes: Rows, intervals: int) -> dict[str, Array]:
         """What DDP.solve starts from: solutions `rows` [n] from their nodes `nodes` [n] on, and LQR after their end."""
@@ -49,21 +54,17 @@ class StationaryBank(NodeBank):
         """The best of descents from the nearest tails, pruned."""
         return pruned(ddp, super().solve(ddp, x, p, count), self.lqr, self.level)
 
-    def cleaned(self, ddp: DDP, rounds: int) -> StationaryBank:
+    def cleaned(self, ddp: DDP, rounds: int) -> Self:
         """Each solution tried again from its nearest neighbours, until hardly any gets better."""
         bank = self
         for _ in range(rounds):
             s = bank.solution
             found = better(s, bank.solve(ddp, s.x[:, 0], s.parameters, 4))
             gained = (found.cost < s.cost * (1 - SAME)).mean()
-            bank = StationaryBank(self.ocp, found, self.lqr, self.level)
+            bank = self.holding(found)
             if gained < RARE:
                 break
         return bank
-
-
-SAME = 1e-4  # of a cost: less is no other optimum
-RARE = 0.01  # of solutions, that get better: few enough
 
 
 def pruned(ddp: DDP, s: Solution, lqr: LQR, level: float) -> Solution:
