@@ -163,7 +163,7 @@ def test_what_is_exported_is_the_same(tmp_path):
 
 def test_a_solver_keeps_its_margins():
     ocp = double_integrator()
-    held, x0 = Held(ocp), np.array([[1.0, 0.0], [0.7, -0.1]])
+    held, x0 = Held(ocp, learned=True), np.array([[1.0, 0.0], [0.7, -0.1]])
     elastic = DDP(ocp, intervals=20, substeps=1, constraints="elastic", threads=1)
     margin = np.where(held.inward, 0.05, 0.0)
     s = held.solver(elastic, margin).solve(x0)
@@ -189,7 +189,7 @@ def test_a_solver_with_margins_is_another_solver():
 
 def test_a_state_between_margin_and_boundary_has_a_label():
     ocp = double_integrator()
-    held = Held(ocp)
+    held = Held(ocp, learned=True)
     elastic = DDP(ocp, intervals=20, substeps=8, constraints="elastic", threads=1)
     ddp = held.solver(elastic, np.where(held.inward, 0.05, 0.0))
     s = held.labels(ddp.solve([[1.0, -0.69], [1.0, -0.7001], [1.0, -1.5]]))
@@ -198,7 +198,7 @@ def test_a_state_between_margin_and_boundary_has_a_label():
 
 
 def test_margins_make_up_for_what_is_exceeded_and_no_more():
-    held = Held(double_integrator())
+    held = Held(double_integrator(), learned=True)
     names = np.array(held.names)
     exceeded = np.full((100, len(names)), -0.3)
     exceeded[:, names == "speed"] = 4e-3
@@ -213,7 +213,7 @@ def test_margins_make_up_for_what_is_exceeded_and_no_more():
 
 def test_equations_have_no_margin():
     ocp = double_integrator()
-    held = Held(replace(ocp, terminal_constraints={"at rest": (0, ocp.system.x[1], 0)}))
+    held = Held(replace(ocp, terminal_constraints={"at rest": (0, ocp.system.x[1], 0)}), learned=True)
     assert held.first[np.array(held.names) == "at rest"] == 0
     assert held.first[np.array(held.names) == "speed"].tolist() == [FIRST, FIRST]
 
@@ -231,7 +231,7 @@ def test_what_a_policy_exceeds_is_what_the_judge_says():
 
 
 def test_margins_and_labels_do_not_know_the_units():
-    plain, other = (Held(double_integrator(unit)) for unit in (1.0, 1e-3))
+    plain, other = (Held(double_integrator(unit), learned=True) for unit in (1.0, 1e-3))
     of_speed = np.array(plain.names) == "speed"
     np.testing.assert_allclose(plain.scales * 1e3, np.where(of_speed, 1, 1e3) * other.scales, rtol=1e-6)
     x0 = np.array([[1.0, 0.0], [0.8, 0.05]])

@@ -2,7 +2,7 @@
 
 Labels hold the problem's constraints by margins more than they ask for, since a policy's own errors lie about the
 boundary: half of them outside. A margin is what all but SELDOM of held-out runs exceed the boundary by, measured under
-the margins before, row by row. Equations and what the output map holds (projection.py) have none.
+the margins before, row by row. Equations and what the output map holds (projection.py, barrier.py) have none.
 
 Plans are elastic: where a state lies between the margin and the boundary, or a little outside, the label goes back in
 as fast as pays. Where no plan stays within LOST of what is held, the state is lost, and no label.
@@ -21,6 +21,7 @@ from nocl.data import Solution
 from nocl.definition import measured
 from nocl.definition.constraints import TOLERANCE
 from nocl.definition.ocp import OCP
+from nocl.solvers.cnd.regression.barrier import guarded
 from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.cnd.regression.labels import Policy, Problems, continuous_run
 from nocl.solvers.cnd.regression.projection import projected
@@ -35,9 +36,13 @@ LOST = 0.01  # of a scale: a plan that leaves more is no label
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """A problem's constraints: rows along the trajectory, then those at its end."""
+    """A problem's constraints: rows along the trajectory, then those at its end.
+
+    learned : whether the policy is trained on learned dynamics; the output map holds no rows of states then
+    """
 
     ocp: OCP
+    learned: bool = False
 
     @property
     def first(self) -> Array:
@@ -48,7 +53,8 @@ class Held:
     def inward(self) -> Any:
         """Which rows have a margin."""
         of = self.ocp.functions
-        return np.r_[~of.rows.equal & ~projected(self.ocp), ~of.end_rows.equal]
+        by_map = projected(self.ocp) | (False if self.learned else guarded(self.ocp))
+        return np.r_[~of.rows.equal & ~by_map, ~of.end_rows.equal]
 
     @cached_property
     def scales(self) -> Array:

@@ -198,7 +198,7 @@ class Training:
         self.learned = dynamics is not None
         self.in_torch = InTorch(ocp, dynamics)
         self.substeps = settings.substeps or substeps_for(ocp, dynamics, settings.intervals, FINE)
-        self.held = Held(ocp) if ocp.in_scales else None  # path constraints alone are a penalty
+        self.held = Held(ocp, self.learned) if ocp.in_scales else None  # path constraints alone are a penalty
         coarse, fine = ("soft", "soft") if self.held is None else ("elastic", "hard")
         self.plain = DDP(ocp, intervals=settings.intervals, substeps=self.substeps, dynamics=dynamics,
                          constraints=coarse)
@@ -362,7 +362,8 @@ class Training:
         """The policy's networks, scaled by the first labels."""
         with _seeded(self.seed):
             self.net, self.inverse = policy_net(self.ocp, self.labels[: self.first], self.settings.hidden,
-                                                self.settings.control_dt, self.own, self.settings.branches)
+                                                self.settings.control_dt, self.own, self.settings.branches,
+                                                self.held is not None and not self.learned)
         self.policy = at_rate(self.net, 0.0) if self.settings.control_dt else self.net  # in continuous time
 
     def _rehearse_export(self) -> None:
@@ -378,7 +379,10 @@ class Training:
         """New margins by what the policy violated, and all labels solved again with them."""
         if self.held is None or self.round > MARGINS:
             return
-        self._inside(np.array(self.history[-1]["next_margin"]))
+        margin = np.array(self.history[-1]["next_margin"])
+        if np.array_equal(margin, self.margin):
+            return
+        self._inside(margin)
         rng, former, self.solved = self._rng(4_000_000 + self.round), self.solved, []
         with self._stage(f"round {self.round}: labels with other margins", len(former)) as bar:
             parts = []
