@@ -50,6 +50,8 @@ ALLOWED = 1e-3  # of a scale
 SETTINGS: dict[str, dict[str, Any]] = {
     name: {"seeds": 12, "starts": 6, "states": 200, "tails": 1500, "visits": 1000, "iterations": 1000, "held_out": 48}
     for name in PROBLEMS}
+SETTINGS["cartpole"] |= {"iterations": 2000}
+SETTINGS["planar"] |= {"iterations": 2000, "intervals": 160}  # its plans on 80 cost 0.6 % more than the optimum
 
 
 def controller(name: str, ocp: OCP, seed: int, runs: Path) -> CND:

@@ -41,7 +41,7 @@ from nocl.nets import FeatureNet
 from nocl.solvers.cnd import TrainSettings
 from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.cnd.regression.labels import Problems, policy_controls
-from nocl.solvers.cnd.validate import feasible, kicked_optima, tube_optima, value_scores
+from nocl.solvers.cnd.validate import kicked_optima, tube_optima, value_scores
 from nocl.solvers.ddp.bank import SolutionBank, better
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP
@@ -60,7 +60,7 @@ def from_there(x: Array, t: Array) -> Problems:
 
 def optimum(ocp: OCP, x0: Array, policy: FeatureNet) -> tuple[Solution, SolutionBank]:
     """The best solutions known from x0, on FINE intervals; those found on the usual grid as a bank."""
-    coarse, fine = DDP(ocp, constraints="soft"), DDP(ocp, intervals=FINE, constraints="soft")
+    coarse, fine = DDP(ocp), DDP(ocp, intervals=FINE)
     found = solve_globally(coarse, x0, starts=8, seed=99)
     own = policy_controls(policy, InTorch(ocp), from_there(x0, np.zeros(len(x0))), FINE)
     best = better(fine.solve(x0, u=np.repeat(found.u, FINE // coarse.intervals, axis=1)), fine.solve(x0, u=own))
@@ -70,13 +70,12 @@ def optimum(ocp: OCP, x0: Array, policy: FeatureNet) -> tuple[Solution, Solution
 def value_errors(ocp: OCP, cnd: nocl.CND, bank: SolutionBank, n: int, seed: int) -> dict[str, float]:
     """Mean |V - J*| / |J*|, and V_x against costates (medians), on n states of the tube about the bank's trajectories
     and n of the controller's own kicked rollouts, solved anew; none of them is among those that training drew. States
-    that cannot hold the path constraints are left out."""
+    from which no plan holds the constraints are left out."""
     acting, rng = (cnd.policy, InTorch(ocp)), np.random.default_rng(seed)
-    fine = DDP(ocp, intervals=FINE // 2, constraints="soft")
+    fine = DDP(ocp, intervals=FINE // 2)
     usual = TrainSettings()
-    sets = {"tube": tube_optima(DDP(ocp, constraints="soft"), fine, bank, *acting, n, usual.width, rng),
-            "tails": kicked_optima(DDP(ocp, constraints="soft"), fine, bank, *acting, n, usual.kick, rng)}
-    sets = {where: feasible(ocp, s) for where, s in sets.items()}
+    sets = {"tube": tube_optima(DDP(ocp), fine, bank, *acting, n, usual.width, rng),
+            "tails": kicked_optima(DDP(ocp), fine, bank, *acting, n, usual.kick, rng)}
     found, row = value_scores(cnd.value_net, *acting, sets), {}
     for where, s in sets.items():
         row |= {f"value_error_{where}_%": round(100 * found[f"{where}_error"], 3),
@@ -92,7 +91,7 @@ def cost_of_kicks(ocp: OCP, policy: FeatureNet, run: Simulation, kicks: list[tup
     after = np.concatenate([run.x[:, slot * nodes] for slot, _ in kicks])
     dx = np.concatenate([dx for _, dx in kicks])
     t = np.repeat([slot * ocp.horizon / SLOTS for slot, _ in kicks], len(run.x))
-    ddp, in_torch, V = DDP(ocp, intervals=FINE // 2, constraints="soft"), InTorch(ocp), []
+    ddp, in_torch, V = DDP(ocp, intervals=FINE // 2), InTorch(ocp), []
     for x in (after - dx, after):
         V.append(ddp.solve(x, t, u=policy_controls(policy, in_torch, from_there(x, t), ddp.intervals)).cost)
     with np.errstate(invalid="ignore"):  # inf - inf where neither was solved
@@ -102,7 +101,7 @@ def cost_of_kicks(ocp: OCP, policy: FeatureNet, run: Simulation, kicks: list[tup
 
 def explained(ocp: OCP, x0: Array, gap: float, cost: float) -> dict[str, Any]:
     """One of the worst initial states: what the controller costs there beside the optima of COLD cold starts."""
-    ddp = DDP(ocp, constraints="soft")
+    ddp = DDP(ocp)
     s = ddp.solve(np.repeat(x0[None], COLD, axis=0), u=random_controls(ocp, ddp.intervals, COLD, 5))
     found = np.sort(s.cost[s.success])
     apart = np.append(True, np.diff(found) > 1e-3 * found[:-1]) if len(found) else []

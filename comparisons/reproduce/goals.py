@@ -38,7 +38,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 CLEAR = 0.1  # m between the car's obstacle and its goal, in the problems that are judged
-MARGIN = 0.008  # m that training keeps from the obstacle
 Bounds = dict[str, tuple[float, float]]
 
 
@@ -94,8 +93,7 @@ def _dubins() -> OCP:
     clear = dubins.distance(car, ca.vertcat(p["obstacle_x"], p["obstacle_y"]), p["radius"])
     return OCP.quadratic(car, p=ca.vertcat(*p.values()), horizon=8.0, x_goal=[*list(p.values())[3:]], u_goal=[0, 0],
                          initial_states=nocl.Uniform([-3.5, -3.0, -1.57], [-2.5, 3.0, 1.57]),
-                         parameters=_within(bounds), path_constraints={"obstacle": clear},
-                         penalty_margin=MARGIN)
+                         parameters=_within(bounds), path_constraints={"obstacle": clear})
 
 
 def _sights(ocp: OCP) -> ca.SX:

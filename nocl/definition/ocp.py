@@ -90,8 +90,9 @@ class OCP:
     path_constraints : mapping from names to casadi.SX
         `constraints` of (x, t, p) alone, each >= 0 (an obstacle: distance minus radius), by their former name.
     penalty, penalty_margin : float
-        Where constraints are soft (training, DDP), penalty * max(margin - c, 0)^2 is added to L for each inequality of
-        (x, t, p), c being a path constraint in its own unit, and any other one as a share of its scale.
+        Where constraints are soft (constraints="soft", method="paper", level sets, NeuralOC), penalty *
+        max(margin - c, 0)^2 is added to L for each inequality of (x, t, p), c being a path constraint in its own unit,
+        and any other one as a share of its scale.
 
     Raises
     ------
@@ -734,6 +735,11 @@ class OCP:
                  *limits.sizes(rows[n:], of.arguments, box, place, self._box)]
         at_end = limits.sizes(end, of.end, box, at_goal, self._box_of_x)
         return limits.joined(rows, np.array(along), given), limits.joined(end, at_end, given)
+
+    @property
+    def is_held(self) -> bool:
+        """Whether there are constraints."""
+        return bool(self.held or self.held_at_end)
 
     @property
     def in_scales(self) -> bool:

@@ -90,8 +90,10 @@ class Judge:
         return failure(what, t, x, until)
 
     def integrator(self, dae: dict[str, Any], grid: Array, method: str) -> ca.Function:
-        """From 0 to the times in `grid`."""
-        options: dict[str, Any] = {**self.options, "linear_multistep_method": method}
+        """From 0 to the times in `grid`, in steps that are no longer than theirs: a policy that jumps, and jumps back,
+        would be stepped over."""
+        options: dict[str, Any] = {**self.options, "linear_multistep_method": method,
+                                   "max_step_size": float(np.diff(grid, prepend=0.0).max())}
         return ca.integrator("judge", "cvodes", dae, 0.0, list(grid), options)
 
     def feedback_dae(self, policy: ca.Function) -> dict[str, Any]:

@@ -2,7 +2,8 @@
 
 Labels hold the problem's constraints by margins more than they ask for, since a policy's own errors lie about the
 boundary: half of them outside. A margin is what all but SELDOM of held-out runs exceed the boundary by, measured under
-the margins before, row by row. Equations and what the output map holds (projection.py, barrier.py) have none.
+the margins before, row by row. Equations and what the output map holds (projection.py, barrier.py) have none, or,
+where the map fails, only then.
 
 Plans are elastic: where a state lies between the margin and the boundary, or a little outside, the label goes back in
 as fast as pays. Where no plan stays within LOST of what is held, the state is lost, and no label.
@@ -30,7 +31,7 @@ from nocl.support.checks import Array
 
 FIRST = 1e-3  # of a scale, the first margin of each row
 LARGEST = 0.05  # of a scale, the largest
-SELDOM = 0.02  # of held-out runs may exceed what a margin makes up for
+SELDOM = 0.03  # of held-out runs may exceed what a margin makes up for
 LOST = 0.01  # of a scale: a plan that leaves more is no label
 
 
@@ -47,14 +48,19 @@ class Held:
     @property
     def first(self) -> Array:
         """The first margins [m + those at the end]."""
-        return np.where(self.inward, FIRST, 0.0)
+        return np.where(self.inward & ~self.guarded, FIRST, 0.0)
 
     @cached_property
     def inward(self) -> Any:
-        """Which rows have a margin."""
+        """Which rows may have a margin."""
         of = self.ocp.functions
-        by_map = projected(self.ocp) | (False if self.learned else guarded(self.ocp))
-        return np.r_[~of.rows.equal & ~by_map, ~of.end_rows.equal]
+        return np.r_[~of.rows.equal & ~projected(self.ocp), ~of.end_rows.equal]
+
+    @cached_property
+    def guarded(self) -> Any:
+        """Which rows the output map holds by braking."""
+        rows = guarded(self.ocp)
+        return np.r_[rows & (not self.learned), np.zeros(len(self.ocp.functions.end_rows), dtype=bool)]
 
     @cached_property
     def scales(self) -> Array:
@@ -94,10 +100,11 @@ class Held:
         return np.where(lost[:, None], np.inf, -least / self.scales)
 
     def next(self, margin: Array, exceeded: Array) -> Array:
-        """The margins for labels of the next round."""
+        """The margins for labels of the next round; those of rows that the map holds stay, unless it fails."""
         if not len(exceeded):
             return margin
-        more = np.quantile(exceeded, 1 - SELDOM, axis=0, method="higher") - TOLERANCE / 2
+        most = np.quantile(exceeded, 1 - SELDOM, axis=0, method="higher")
+        more = np.where(self.guarded & (most <= TOLERANCE), 0.0, most - TOLERANCE / 2)
         return np.where(self.inward, np.clip(margin + more, 0.0, LARGEST), 0.0)
 
     def summary(self, exceeded: Array, name: str) -> dict[str, Any]:

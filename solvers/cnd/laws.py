@@ -201,7 +201,8 @@ class LawTraining:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
             phi = without_clock(self.ocp, self.labels, self.own)
-            self.net, self.inverse = net_on(self.ocp, phi, self.labels, s.hidden, s.branches)
+            self.net, self.inverse = net_on(self.ocp, phi, self.labels, s.hidden, s.branches,
+                                            float(np.median(self.bank.solution.t[:, -1])))
 
     def _visit(self) -> None:
         s, rng = self.settings, own_numbers(self.seed, self.round)

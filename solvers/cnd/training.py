@@ -20,6 +20,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,6 +40,7 @@ from nocl.solvers.cnd.laws import LawTraining, check_law
 from nocl.solvers.cnd.paper import PaperSettings, train_paper
 from nocl.solvers.cnd.plan import KICKED, PAYS, VALUE_HELD_OUT, Plan, measured, missed_by, stalled
 from nocl.solvers.cnd.plan import iterations as planned_iterations
+from nocl.solvers.cnd.regression import barrier
 from nocl.solvers.cnd.regression.features import at_rate, own_features, policy_net
 from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.cnd.regression.labels import (
@@ -58,7 +60,6 @@ from nocl.solvers.cnd.stationary import StationaryTraining, check_stationary
 from nocl.solvers.cnd.validate import (
     advice,
     cannot_hold,
-    feasible,
     floored_by,
     gap,
     held_gap,
@@ -73,7 +74,7 @@ from nocl.solvers.cnd.validate import (
 )
 from nocl.solvers.cnd.value import ValueLabels, on_fine_grid, value_loss, value_net, value_tails
 from nocl.solvers.ddp.bank import SolutionBank, better, extend
-from nocl.solvers.ddp.global_search import solve_globally
+from nocl.solvers.ddp.global_search import OnMessage, solve_globally
 from nocl.solvers.ddp.opinion import second_opinion
 from nocl.solvers.ddp.solver import DDP, substeps_for
 from nocl.support import checks, store
@@ -91,7 +92,7 @@ if TYPE_CHECKING:
 __all__ = ["TrainSettings", "train"]
 CHECKPOINT = "training.safetensors"
 VALUE_LARGE = 0.05  # mean |V - J*| / J* that a warning is given above
-MARGINS = 2  # rounds that begin with new margins, where there are constraints
+MARGINS = 3  # rounds that begin with new margins, where there are constraints
 LOSSES = 40  # of each regression that the card keeps
 REHEARSED = (16, 16)  # points inside the box, and corners, at which an export is tried before training
 
@@ -164,7 +165,7 @@ def estimate(ocp: OCP, settings: TrainSettings, seed: int = 0) -> str:
     with one_thread(), within(False):
         run = Training(ocp, None, settings, seed, None, False)
         costs = measured(ocp, run.ddp, run.fine, run.in_torch, settings)
-    return str(Plan(settings, costs, parameters=ocp.np > 0, margins=run.held is not None))
+    return str(Plan(settings, costs, parameters=ocp.np > 0, margins=run._may_move))
 
 
 def _check(ocp: OCP, dynamics: LearnedDynamics | None, seed: int, out: str | os.PathLike[str] | None) -> None:
@@ -198,8 +199,8 @@ class Training:
         self.learned = dynamics is not None
         self.in_torch = InTorch(ocp, dynamics)
         self.substeps = settings.substeps or substeps_for(ocp, dynamics, settings.intervals, FINE)
-        self.held = Held(ocp, self.learned) if ocp.in_scales else None  # path constraints alone are a penalty
-        coarse, fine = ("soft", "soft") if self.held is None else ("elastic", "hard")
+        self.held = Held(ocp, self.learned) if ocp.is_held else None
+        coarse, fine = ("hard", "hard") if self.held is None else ("elastic", "hard")
         self.plain = DDP(ocp, intervals=settings.intervals, substeps=self.substeps, dynamics=dynamics,
                          constraints=coarse)
         self.fine = DDP(ocp, intervals=4 * settings.intervals, substeps=-(-self.substeps // 4), dynamics=dynamics,
@@ -212,7 +213,7 @@ class Training:
         self.losses: list[float] = []
         self.value_card: dict[str, Any] = {}
         self.opinion: dict[str, Any] = {}  # of NMPC, where it was asked for one
-        self.plan = Plan(settings, None, ENDLESS, parameters=ocp.np > 0, margins=self.held is not None)
+        self.plan = Plan(settings, None, ENDLESS, parameters=ocp.np > 0, margins=self._may_move)
         self.best: tuple[float, int, dict[str, Any]] | None = None  # how far from the goals, the round, the weights
         self.stopped = "the goals are met"
 
@@ -220,6 +221,17 @@ class Training:
         """Labels keep these margins from now on."""
         self.margin = margin
         self.ddp = self.plain if margin is None or self.held is None else self.held.solver(self.plain, margin)
+
+    @property
+    def _may_move(self) -> bool:
+        """Whether rows have margins that the rounds move."""
+        return self.held is not None and bool((self.held.inward & ~self.held.guarded).any())
+
+    @cached_property
+    def steps(self) -> int:
+        """Of what the policy is judged by, for each interval of the fine grid."""
+        quick = 0 if self.held is None or self.learned else barrier.steps(self.ocp, self.ocp.longest)
+        return max(self.fine.substeps, -(-quick // self.fine.intervals))
 
     def run(self) -> CND:
         with one_thread(), within(self.progress):
@@ -257,7 +269,7 @@ class Training:
         costs = None
         if budget.limited or (shown(self.progress) and not self.round):
             costs = measured(self.ocp, self.ddp, self.fine, self.in_torch, s, self.own)
-        self.plan = Plan(s, costs, budget, parameters=self.ocp.np > 0, margins=self.held is not None)
+        self.plan = Plan(s, costs, budget, parameters=self.ocp.np > 0, margins=self._may_move)
         if not self.round:
             say(f"{self.ocp.system.name}: training takes {self.plan}", self.progress)
 
@@ -270,7 +282,7 @@ class Training:
             self.stopped = f"{s.rounds} rounds are used up"
         elif self.round and not self.plan.another(self.round):
             self.stopped = f"no time for a further round within {s.minutes:g} minutes"
-        elif self.held is None and stalled(self.history, s):
+        elif not self._may_move and stalled(self.history, s):
             self.stopped = "the last two rounds did not pay"
         else:
             return True
@@ -313,8 +325,7 @@ class Training:
                 bar.update()
 
             first = Problems.initial(self.ocp, s.seeds, rng)
-            seeds = solve_globally(self.ddp, first.x, p=first.given_p, starts=s.starts, seed=rng, report=report)
-            seeds = self._second_opinion(seeds)
+            seeds = self._second_opinion(self._seeds(first, s.starts, rng, report))
             self.bank = SolutionBank.of(self.ddp, self._held(seeds))
             if s.states:
                 further = Problems.initial(self.ocp, s.states, rng)
@@ -326,6 +337,20 @@ class Training:
             parts = [self.bank.solution] + ([tube(self.ddp, self.bank, s.tails, s.width, rng)] if s.tails else [])
             self.labels = Labels.join([self._labels(p, rng) for p in parts])
             self.first = len(self.labels)
+
+    def _seeds(self, first: Problems, starts: int, rng: np.random.Generator,
+               report: OnMessage) -> Solution:
+        """Optima from cold starts. Where there are constraints they hold them, and labels go on from there: cold starts
+        that may pay for a violation end in worse optima, that pay."""
+        search = {"p": first.given_p, "seed": rng}
+        if self.held is None:
+            return solve_globally(self.ddp, first.x, starts=starts, report=report, **search)
+        hard = DDP(self.ocp, intervals=self.plain.intervals, substeps=self.substeps, dynamics=self.plain.dynamics,
+                   constraints="hard", between=False)
+        found = solve_globally(hard, first.x, starts=starts, report=report, **search)
+        if not found.success.any():
+            return solve_globally(self.ddp, first.x, starts=starts, **search)
+        return solve_globally(self.ddp, first.x, starts=0, known=found, **search)
 
     def _second_opinion(self, seeds: Solution) -> Solution:
         """The seeds, better ones where NMPC knows some, and then all of them solved from these: where a quadratic term
@@ -363,7 +388,7 @@ class Training:
         with _seeded(self.seed):
             self.net, self.inverse = policy_net(self.ocp, self.labels[: self.first], self.settings.hidden,
                                                 self.settings.control_dt, self.own, self.settings.branches,
-                                                self.held is not None and not self.learned)
+                                                0.0 if self.learned else self.ocp.longest)
         self.policy = at_rate(self.net, 0.0) if self.settings.control_dt else self.net  # in continuous time
 
     def _rehearse_export(self) -> None:
@@ -380,7 +405,7 @@ class Training:
         if self.held is None or self.round > MARGINS:
             return
         margin = np.array(self.history[-1]["next_margin"])
-        if np.array_equal(margin, self.margin):
+        if margin.tolist() == self.history[-1]["margin"]:
             return
         self._inside(margin)
         rng, former, self.solved = self._rng(4_000_000 + self.round), self.solved, []
@@ -436,8 +461,8 @@ class Training:
             tails = kicked_optima(*solvers, *acting, KICKED * s.held_out, s.kick, rng)
             row = {"round": self.round, "labels": len(self.labels), "loss": self.losses,
                    "unsolved": s.held_out - len(starts) - cannot_hold(fresh),
-                   **summary(gap(*acting, starts, substeps=self.fine.substeps), "gap"),
-                   **summary(gap(*acting, tails, self._unit(), self.fine.substeps), "kicked")}
+                   **summary(gap(*acting, starts, substeps=self.steps), "gap"),
+                   **summary(gap(*acting, tails, self._unit(), self.steps), "kicked")}
             if self.held is not None:
                 row |= self._violations(starts, tails) | {"infeasible": cannot_hold(fresh)}
             if s.control_dt:
@@ -456,10 +481,10 @@ class Training:
         """What the policy violates on held-out states, and the margins that follow from it."""
         assert self.held is not None
         assert self.margin is not None
-        steps, over = self.fine.substeps * self.fine.intervals, []
+        over = []
         for s in (starts, tails):
             at = Problems(s.x[:, 0], s.t[:, 0], s.parameters)
-            over.append(self.held.exceeded(self.policy, self.in_torch, at, steps))
+            over.append(self.held.exceeded(self.policy, self.in_torch, at, self.steps * self.fine.intervals))
         return {**self.held.summary(over[0], "gap"), **self.held.summary(over[1], "kicked"),
                 "margin": self.margin.tolist(), "next_margin": self.held.next(self.margin, over[0]).tolist()}
 
@@ -502,8 +527,7 @@ class Training:
         return net
 
     def _value_optima(self) -> dict[str, Solution]:
-        """What V is judged on: initial states, states of the tube, and states of kicked rollouts, solved anew; where
-        there are path constraints, those that can hold them."""
+        """What V is judged on: initial states, states of the tube, and states of kicked rollouts, solved anew."""
         s, rng = self.plan.within("value check"), self._rng(3_000_000)
         solvers, n = (self.ddp, self.fine, self.bank), VALUE_HELD_OUT * s.held_out
         acting = (self.policy, self.in_torch)
@@ -514,8 +538,7 @@ class Training:
             bar.update()
             sets["tails"] = kicked_optima(*solvers, *acting, n, s.kick, rng)
             bar.update()
-        held = sets if self.held else {name: feasible(self.ocp, optima) for name, optima in sets.items()}
-        return {name: optima for name, optima in held.items() if len(optima)} or sets
+        return {name: optima for name, optima in sets.items() if len(optima)} or sets
 
     def _value_labels(self, rng: np.random.Generator, attempt: int) -> ValueLabels:
         s = self.plan.within("value labels", attempt)
@@ -580,7 +603,8 @@ class Training:
         return own_numbers(self.seed, stage)
 
     def _identity(self) -> str:
-        known = identity(self.ocp, self.settings, self.seed, self.in_torch.function["f"])
+        known = identity(self.ocp, self.settings, self.seed, self.in_torch.function["f"],
+                         **({} if self.held is None else {"constraints": "held"}))
         return known if self.own is None else fingerprint(known, self.own)
 
     def _save(self) -> None:

@@ -10,8 +10,6 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from torch import Tensor
 
 from nocl.data import Solution
-from nocl.definition import measured
-from nocl.definition.ocp import OCP
 from nocl.hjb import hjb_residual
 from nocl.nets import FeatureNet
 from nocl.solvers.cnd.regression.in_torch import InTorch
@@ -65,14 +63,6 @@ def kicked_optima(ddp: DDP, fine: DDP, bank: SolutionBank, policy: Policy, torch
     """The optima from n states that the policy visits under kicks, at times all over the horizon."""
     at = kicked_states(bank, policy, torch_ocp, n, kick, rng, ddp.substeps)
     return refined(fine, answered(ddp, bank, policy, torch_ocp, at))
-
-
-def feasible(ocp: OCP, s: Solution) -> Solution:
-    """The solutions that hold all path constraints at all nodes: where a collision can no longer be avoided, V is that
-    of the penalty."""
-    if not ocp.h_titles:
-        return s
-    return s[(measured.least(ocp, s.x, s.t, s.parameters) >= 0).all(axis=1)]
 
 
 def tube_optima(ddp: DDP, fine: DDP, bank: SolutionBank, policy: Policy, torch_ocp: InTorch, n: int, width: float,

@@ -1,8 +1,8 @@
 """Constraints of states in the output map of a policy: near a boundary it brakes in time.
 
 A network's errors lie on both sides of a boundary, so a policy that is trained to touch it is outside half of the time;
-margins that keep it inside cost much (cart-pole on a track: 4 % for 1 % of the track). The map costs next to nothing
-instead: what the network says is moved, as little as needed, to where the run cannot leave.
+margins that keep it inside cost much (cart-pole on a track: 4 % for 1 % of the track). The map costs little instead:
+what the network says is moved to where the run stays inside.
 
 A row h(x, t, p) >= 0 that the control moves by its first derivative along f, as a limit of speed, or by its second, as
 a track, is held by (control barrier functions: Ames et al., IEEE TAC 62(8), 2017)
@@ -13,29 +13,39 @@ a track, is held by (control barrier functions: Ames et al., IEEE TAC 62(8), 201
 b = h'^2 / (2 h) is the constant braking that stops at the boundary; a run that touches the boundary tends to it by
 itself. The other term lets braking be less while there is time, w, and while it takes less than a share r of B, the
 most that U gives. Where b = r B, b stays what it is, and h' -> 0 as h -> 0. Corrections take a time s, at least that
-for which a control is held: b <= -h' / s. Where U does not give h'' >= 0, or at a boundary h' >= 0, no map helps: the
-network is there to see it coming.
+for which a control is held: b <= -h' / s. The boundary is where half of what is allowed is used up.
+
+Rows are for the map where the control moves that derivative, affinely, as much as usual at all places near the
+boundary, and U gives h' >= 0, or h'' >= 0, at most of them. Others are not, like the distance of a rotor craft from
+what is beside it: the map would do harm by asking for what cannot be. Margins hold such rows (held.py). The map looks
+at one row after the other, each with all of U: in a corner of two boundaries it may give too little.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from nocl.definition.constraints import TOLERANCE
 from nocl.definition.ocp import OCP
+from nocl.solvers.cnd.regression.projection import retracted
 from nocl.translate.arguments import Arguments
 
-CORRECTION = 1 / 400  # of the horizon: s
+CORRECTION = 1 / 400  # of a run: s, or less
+BEYOND = TOLERANCE / 4  # of a scale: how far a run gets beyond a boundary within s, while half of U turns it back
 WINDOW = 10  # of corrections: w
 NOTHING = 1e-9  # of a scale
 PASSES = 2  # over the rows, where there are several
-TRIED = 256  # places at which it is seen whether the control moves a row
+TRIED = 4096  # places at which rows are looked at: of those inside, the quarter nearest to the boundary
+SURE = 0.1  # of the usual movement: a row that it moves less somewhere is not for the map
+MOSTLY = 0.9  # of these places: where U must be able to turn it back
 IDLE = 1e-9  # of the largest: less is no movement
-RESERVE = 0.9  # of the braking that U gives: r
-FLAT = 1e-3  # of the usual movement: where the control moves a row less than that, it is not asked for more
+RESERVE = 0.98  # of the braking that U gives: r
+FLAT = 0.03  # of the usual movement: where the control moves a row less than that, little is asked of it
 
 
 class Moved(NamedTuple):
@@ -45,7 +55,7 @@ class Moved(NamedTuple):
     slope: ca.SX
     moved: ca.SX
     order: int
-    usual: float  # how far the half of U moves it, a median over X
+    usual: float  # how far the half of U moves it, a median over X near h = 0
 
 
 def guarded(ocp: OCP) -> NDArray[np.bool_]:
@@ -65,14 +75,14 @@ def _rows(ocp: OCP) -> list[tuple[int, Moved]]:
 
 
 def _moved(ocp: OCP, i: int) -> Moved | None:
-    """The first or second derivative of row i along f that the control moves; None where neither does."""
+    """The first or second derivative of row i along f that the control moves; None where the map cannot hold it so."""
     of = ocp.functions
-    h, at = of.rows.column[i] / float(of.scales[i]), of.arguments
+    h, at = of.rows.column[i] / float(of.scales[i]) + TOLERANCE / 2, of.arguments
     slope = _along(ocp, h)
     for order, moved in ((1, slope), (2, _along(ocp, slope))):
         by_u = ca.jacobian(moved, at["u"])
         if by_u.nnz():
-            usual = _usual(ocp, by_u)
+            usual = 0.0 if ca.depends_on(by_u, at["u"]) else _usual(ocp, h, moved, by_u)
             return Moved(h, slope, moved, order, usual) if usual > 0 else None
     return None
 
@@ -84,40 +94,66 @@ def _along(ocp: OCP, e: ca.SX) -> ca.SX:
     return change + ca.jtimes(e, at["t"], ca.SX(1)) if "t" in at.names else change
 
 
-def _usual(ocp: OCP, by_u: ca.SX) -> float:
-    """A usual size of by_u [1, nu] times half of U; 0 where it is none at most places."""
-    s, rng = ocp.system, np.random.default_rng(0)
+def _usual(ocp: OCP, h: ca.SX, moved: ca.SX, by_u: ca.SX) -> float:
+    """The median size of by_u [1, nu] times half of U where h >= 0 is small; 0 where the control is no sure hold."""
+    s, rng, at = ocp.system, np.random.default_rng(0), ocp.functions.arguments
     x, u = rng.uniform(s.lbx, s.ubx, (TRIED, s.nx)), rng.uniform(s.lbu, s.ubu, (TRIED, s.nu))
-    at = ocp.functions.arguments
-    values = at.function("by_u", {"by_u": ca.densify(by_u)})(*at.columns(x=x, u=u, **ocp.moments(TRIED))).full()
-    size = np.linalg.norm(values.reshape(s.nu, TRIED, order="F") * ((s.ubu - s.lbu) / 2)[:, None], axis=0)
-    size = size[np.isfinite(size)]
-    return float(np.median(size)) if size.size and np.median(size) > IDLE * size.max() else 0.0
+    size = ca.norm_2(by_u.T * ca.DM((s.ubu - s.lbu) / 2))
+    best = moved + ca.mtimes(by_u, _best(ocp, by_u) - at["u"])
+    tried = at.function("tried", {"h": h, "size": size, "best": best})
+    distance, sizes, most = (ca.DM(value).full().ravel()
+                             for value in tried(*at.columns(x=x, u=u, **ocp.moments(TRIED))))
+    fine = np.isfinite(distance) & np.isfinite(sizes) & np.isfinite(most) & (distance >= 0)
+    order = np.flatnonzero(fine)[np.argsort(distance[fine])][:max(int(fine.sum()) // 4, 1)]
+    if not order.size:
+        return 0.0
+    usual = float(np.median(sizes[order]))
+    sure = sizes[order].min() > SURE * usual and usual > IDLE * sizes[fine].max()
+    return usual if sure and (most[order] >= 0).mean() >= MOSTLY else 0.0
 
 
-def braked(ocp: OCP, at: Arguments, v: ca.SX) -> ca.SX:
-    """v [nu] moved to where the rows of `guarded` are held, at symbols `at` of a policy: x, t[, p][, dt]."""
+def _best(ocp: OCP, by_u: ca.SX) -> ca.SX:
+    """The control in U, and in what the output map holds of u alone, that moves a row the most, or nearly."""
+    s = ocp.system
+    return retracted(ocp, ca.if_else(by_u.T > 0, ca.DM(s.ubu), ca.DM(s.lbu)))
+
+
+def steps(ocp: OCP, lasting: float) -> int:
+    """How many steps of RK4 a run takes at least where the map is at work."""
+    return math.ceil(max((lasting / _time(row, lasting) for _, row in _rows(ocp)), default=1.0))
+
+
+def _time(row: Moved, lasting: float) -> float:
+    """s of a row."""
+    quick = math.sqrt(2 * BEYOND / row.usual) if row.order == 2 else math.inf
+    return min(CORRECTION * lasting, quick)
+
+
+def braked(ocp: OCP, at: Arguments, v: ca.SX, lasting: float) -> ca.SX:
+    """v [nu] moved to where the rows of `guarded` are held, at symbols `at` of a policy: x, t[, p][, dt].
+
+    lasting : how long a run is, in the system's unit of time; s and w are shares of it
+    """
     rows = _rows(ocp)
     if not rows:
         return v
-    own, step = ocp.functions.arguments, CORRECTION * ocp.longest
-    said, least = ca.SX.sym("v", ocp.system.nu), ca.SX.sym("s")
-    wanted = [_wanted(ocp, row, said, least) for _, row in rows]
+    own, said, dt = ocp.functions.arguments, ca.SX.sym("v", ocp.system.nu), ca.SX.sym("dt")
+    wanted = [_wanted(ocp, row, said, ca.fmax(_time(row, lasting), dt)) for _, row in rows]
     u = said
     for _ in range(PASSES if len(wanted) > 1 else 1):
         for short, by_u, usual in wanted:
             u = _pushed(ocp, u, said, short, by_u, usual)
-    moved = own.but("u").function("braked", {"u": u}, v=said, s=least)
-    return at.given(v=v, s=ca.fmax(step, at["dt"]) if "dt" in at.names else ca.SX(step)).call(moved)
+    moved = own.but("u").function("braked", {"u": u}, v=said, dt=dt)
+    return at.given(v=v, dt=at["dt"] if "dt" in at.names else ca.SX(0)).call(moved)
 
 
 def _wanted(ocp: OCP, row: Moved, v: ca.SX, s: ca.SX) -> tuple[ca.SX, ca.SX, float]:
     """(what is missing at v, the row's slope by u there, how far U usually moves it)."""
-    u, w, U = ocp.functions.arguments["u"], WINDOW * s, ocp.system
+    u, w = ocp.functions.arguments["u"], WINDOW * s
     by_u, got = (ca.substitute(e, u, v) for e in (ca.jacobian(row.moved, u), row.moved))
     if row.order == 1:
         return -ca.fmax(row.h, 0) / s - ca.fmin(row.h, 0) / w - got, by_u, row.usual
-    most = got + ca.mtimes(by_u, (U.ubu + U.lbu) / 2 - v) + ca.mtimes(ca.fabs(by_u), (U.ubu - U.lbu) / 2)
+    most = got + ca.mtimes(by_u, _best(ocp, by_u) - v)
     closing = ca.fmin(row.slope, 0)
     stop = closing**2 / (ca.fmax(2 * row.h, -s * closing) + NOTHING)
     spare = ca.fmax(1 - stop / (RESERVE * ca.fmax(most, IDLE * row.usual)), 0)
@@ -125,9 +161,13 @@ def _wanted(ocp: OCP, row: Moved, v: ca.SX, s: ca.SX) -> tuple[ca.SX, ca.SX, flo
 
 
 def _pushed(ocp: OCP, u: ca.SX, v: ca.SX, missing: ca.SX, by_u: ca.SX, usual: float) -> ca.SX:
-    """u with the smallest change, in halves of U, that makes up for what is missing at v, in U."""
+    """u changed, as little as needed in halves of U, by what is missing at v; where that leaves U, the rest is made up
+    on the way to the control that moves the row the most."""
     s = ocp.system
-    half = ca.DM(((s.ubu - s.lbu) / 2) ** 2)
+    half, small = ca.DM(((s.ubu - s.lbu) / 2) ** 2), (FLAT * usual) ** 2
     short = ca.fmax(missing - ca.mtimes(by_u, u - v), 0)
-    step = half * by_u.T * short / (ca.mtimes(by_u, half * by_u.T) + (FLAT * usual) ** 2)
-    return ca.fmin(ca.fmax(u + step, ca.DM(s.lbu)), ca.DM(s.ubu))
+    step = half * by_u.T * short / (ca.mtimes(by_u, half * by_u.T) + small)
+    moved = retracted(ocp, ca.fmin(ca.fmax(u + step, ca.DM(s.lbu)), ca.DM(s.ubu)))
+    rest, to_best = ca.fmax(missing - ca.mtimes(by_u, moved - v), 0), _best(ocp, by_u) - moved
+    gain = ca.mtimes(by_u, to_best)
+    return moved + to_best * ca.fmin(rest * gain / (gain**2 + small), 1)

@@ -1,7 +1,4 @@
-"""An OCP in torch, as training uses it: f, L and G of rows that have parameters of their own.
-
-Path constraints alone are a penalty in L; where there are others, labels hold all of them, and L is the problem's own.
-"""
+"""An OCP in torch, as training uses it: f, L and G of rows that have parameters of their own."""
 
 from __future__ import annotations
 
@@ -31,8 +28,7 @@ class InTorch:
         self.takes = {"f": names if dynamics is None else ocp.system.arguments.names, "L": names,
                       "G": ocp.functions.end.names}
         self.n_p = {"f": ocp.np if dynamics is None else ocp.system.np, "L": ocp.np, "G": ocp.np}
-        L = ocp.L if ocp.in_scales else ocp.L_soft
-        self.function = {"f": dynamics or to_torch(ocp.functions.f), "L": to_torch(L), "G": to_torch(ocp.G)}
+        self.function = {"f": dynamics or to_torch(ocp.functions.f), "L": to_torch(ocp.L), "G": to_torch(ocp.G)}
 
     def at(self, p: Array) -> Rows:
         """The problem for rows with parameters p [B, np]."""
