@@ -102,6 +102,16 @@ def test_cartpole_equals_scipy(hold):
         assert result.control_magnitude[i] * 4 == pytest.approx(z[5], abs=1e-4)
 
 
+def test_a_short_pulse_is_not_stepped_over():
+    """x' = u and u = 1 from 2.0 to 2.15 alone: all derivatives are 0 before, and steps would grow across it."""
+    x, u, t = ca.SX.sym("x"), ca.SX.sym("u"), ca.SX.sym("t")
+    system = nocl.System("hold", x=x, u=u, xdot=u, lbu=[-1], ubu=[1], lbx=[-1], ubx=[1])
+    ocp = nocl.OCP(system, horizon=4.0, running=u**2, terminal=x**2, x_goal=[0], u_goal=[0],
+                   initial_states=nocl.Gaussian([0], [0.1]))
+    law = ca.Function("law", [x, t], [ca.if_else(ca.fabs(t - 2.075) < 0.075, 1.0, 0.0)], ["x", "t"], ["u"])
+    assert nocl.simulate(ocp, law, [[0.0]], nodes=41).x[0, -1, 0] == pytest.approx(0.15, abs=1e-6)
+
+
 def test_sampled_feedback_is_the_exact_discretisation():
     """Double integrator, u = -k x held: x+ = (Ad - Bd k) x with the matrix exponential."""
     ocp = nocl.load_ocp("double_integrator")
