@@ -143,7 +143,7 @@ def braked(ocp: OCP, at: Arguments, v: ca.SX, lasting: float) -> ca.SX:
     for _ in range(PASSES if len(wanted) > 1 else 1):
         for short, by_u, usual in wanted:
             u = _pushed(ocp, u, said, short, by_u, usual)
-    moved = own.but("u").function("braked", {"u": u}, v=said, dt=dt)
+    moved = own.but("u").function("braked", {"u": ca.cse(u)}, v=said, dt=dt)
     return at.given(v=v, dt=at["dt"] if "dt" in at.names else ca.SX(0)).call(moved)
 
 
