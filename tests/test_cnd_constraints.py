@@ -246,6 +246,20 @@ def test_margins_and_labels_do_not_know_the_units():
 # Training
 
 
+def test_seeds_hold_what_can_be_held_and_the_others_pay_for_little():
+    """From v = -0.75 beyond the limit of 0.7 no plan holds it; from the others all do, and cost what those cost."""
+    ocp = double_integrator()
+    x0 = np.array([[1.0, 0.0], [0.9, 0.05], [0.8, -0.75]])
+    training = Training(ocp, None, TINY, 0, None, False)
+    at = Problems(x0, np.zeros(3), np.zeros((3, 0)))
+    found = training._seeds(at, 3, np.random.default_rng(0), lambda _: None)
+    hard = DDP(ocp, intervals=20, substeps=training.substeps, threads=1).solve(x0)
+    assert found.success.all()
+    np.testing.assert_allclose(found.cost[:2], hard.cost[:2], rtol=1e-6)
+    assert (np.abs(found.x[:2, :, 1]) <= 0.7 + 1e-7).all()
+    assert hard.success.tolist() == [True, True, False]
+
+
 def test_lost_states_are_no_labels():
     ocp = double_integrator()
     held = Held(ocp)
