@@ -77,7 +77,7 @@ def optimum(ocp: OCP, x0: Array, cnd: CND) -> tuple[Solution, SolutionBank]:
 
 
 def violations(ocp: OCP, run: Any, feasible: Array) -> dict[str, Any]:
-    over = np.where(run.success, run.violation, np.inf)[feasible]
+    over = np.where(run.reached, run.violation, np.inf)[feasible]
     order = np.flatnonzero(feasible)[np.argsort(-over)][:5]
     return {"runs": int(feasible.sum()), "left out, no plan holds": int((~feasible).sum()),
             "violating": float((over > ALLOWED).mean()), "worst": float(over.max()),
@@ -93,7 +93,7 @@ def gaps(J: Array, best: Array) -> dict[str, float]:
 def kicked(ocp: OCP, cnd: CND, run: Any, bank: SolutionBank, rng: np.random.Generator) -> dict[str, Any]:
     """One kick each, and what is violated from there on."""
     ddp, times = DDP(ocp), np.sort(rng.choice(np.arange(8, NODES - 8), KICKS, replace=False))
-    groups, fine, over = np.array_split(rng.permutation(np.flatnonzero(run.success)), KICKS), [], []
+    groups, fine, over = np.array_split(rng.permutation(np.flatnonzero(run.reached)), KICKS), [], []
     for k, rows in zip(times, groups, strict=True):
         t = float(run.t[k])
         x = run.x[rows, k] + KICK * bank.scale[:ocp.system.nx] * rng.standard_normal((len(rows), ocp.system.nx))
@@ -101,7 +101,7 @@ def kicked(ocp: OCP, cnd: CND, run: Any, bank: SolutionBank, rng: np.random.Gene
         own = ddp.solve(x, t, u=policy_controls(cnd.policy, InTorch(ocp), at, ddp.intervals), progress=False)
         fine.append(better(own, extend(ddp, bank, x, 3, t)).success)
         later = simulate(ocp, cnd, x, t0=t, nodes=81)
-        over.append(np.where(later.success, later.violation, np.inf))
+        over.append(np.where(later.reached, later.violation, np.inf))
     holds, worst = np.concatenate(fine), np.concatenate(over)
     return {"runs": int(holds.sum()), "left out, no plan holds": int((~holds).sum()),
             "violating": float((worst[holds] > ALLOWED).mean()), "worst": float(worst[holds].max()),
