@@ -46,7 +46,7 @@ FINE = 320  # intervals of J*
 NODES = 161  # of a judged run
 KICK, KICKS = 0.02, 5  # of each state's spread; times, each for a fifth of the runs
 ALLOWED = 1e-3  # of a scale
-# each within about three minutes of two cores: the problems with hard searches take fewer labels
+# fewer labels than usual, since constrained ones take longer
 SETTINGS: dict[str, dict[str, Any]] = {
     name: {"seeds": 12, "starts": 6, "states": 200, "tails": 1500, "visits": 1000, "iterations": 1000, "held_out": 48}
     for name in PROBLEMS}

@@ -165,7 +165,7 @@ def estimate(ocp: OCP, settings: TrainSettings, seed: int = 0) -> str:
     with one_thread(), within(False):
         run = Training(ocp, None, settings, seed, None, False)
         costs = measured(ocp, run.ddp, run.fine, run.in_torch, settings)
-    return str(Plan(settings, costs, parameters=ocp.np > 0, margins=run._may_move))
+    return str(Plan(settings, costs, parameters=ocp.np > 0, margins=run.margins_move))
 
 
 def _check(ocp: OCP, dynamics: LearnedDynamics | None, seed: int, out: str | os.PathLike[str] | None) -> None:
@@ -200,11 +200,9 @@ class Training:
         self.in_torch = InTorch(ocp, dynamics)
         self.substeps = settings.substeps or substeps_for(ocp, dynamics, settings.intervals, FINE)
         self.held = Held(ocp, self.learned) if ocp.is_held else None
-        coarse, fine = ("hard", "hard") if self.held is None else ("elastic", "hard")
         self.plain = DDP(ocp, intervals=settings.intervals, substeps=self.substeps, dynamics=dynamics,
-                         constraints=coarse)
-        self.fine = DDP(ocp, intervals=4 * settings.intervals, substeps=-(-self.substeps // 4), dynamics=dynamics,
-                        constraints=fine)
+                         constraints="hard" if self.held is None else "elastic")
+        self.fine = DDP(ocp, intervals=4 * settings.intervals, substeps=-(-self.substeps // 4), dynamics=dynamics)
         self.solved: list[Solution] = []  # what the labels are of, where constraints have margins that may change
         self._inside(None if self.held is None else self.held.first)
         self.checkpoint = None if out is None else Path(out) / CHECKPOINT
@@ -213,7 +211,7 @@ class Training:
         self.losses: list[float] = []
         self.value_card: dict[str, Any] = {}
         self.opinion: dict[str, Any] = {}  # of NMPC, where it was asked for one
-        self.plan = Plan(settings, None, ENDLESS, parameters=ocp.np > 0, margins=self._may_move)
+        self.plan = Plan(settings, None, ENDLESS, parameters=ocp.np > 0, margins=self.margins_move)
         self.best: tuple[float, int, dict[str, Any]] | None = None  # how far from the goals, the round, the weights
         self.stopped = "the goals are met"
 
@@ -223,7 +221,7 @@ class Training:
         self.ddp = self.plain if margin is None or self.held is None else self.held.solver(self.plain, margin)
 
     @property
-    def _may_move(self) -> bool:
+    def margins_move(self) -> bool:
         """Whether rows have margins that the rounds move."""
         return self.held is not None and bool((self.held.inward & ~self.held.guarded).any())
 
@@ -269,7 +267,7 @@ class Training:
         costs = None
         if budget.limited or (shown(self.progress) and not self.round):
             costs = measured(self.ocp, self.ddp, self.fine, self.in_torch, s, self.own)
-        self.plan = Plan(s, costs, budget, parameters=self.ocp.np > 0, margins=self._may_move)
+        self.plan = Plan(s, costs, budget, parameters=self.ocp.np > 0, margins=self.margins_move)
         if not self.round:
             say(f"{self.ocp.system.name}: training takes {self.plan}", self.progress)
 
@@ -282,7 +280,7 @@ class Training:
             self.stopped = f"{s.rounds} rounds are used up"
         elif self.round and not self.plan.another(self.round):
             self.stopped = f"no time for a further round within {s.minutes:g} minutes"
-        elif not self._may_move and stalled(self.history, s):
+        elif not self.margins_move and stalled(self.history, s):
             self.stopped = "the last two rounds did not pay"
         else:
             return True
@@ -338,15 +336,14 @@ class Training:
             self.labels = Labels.join([self._labels(p, rng) for p in parts])
             self.first = len(self.labels)
 
-    def _seeds(self, first: Problems, starts: int, rng: np.random.Generator,
-               report: OnMessage) -> Solution:
+    def _seeds(self, first: Problems, starts: int, rng: np.random.Generator, report: OnMessage) -> Solution:
         """Optima from cold starts. Where there are constraints they hold them, and labels go on from there: cold starts
         that may pay for a violation end in worse optima, that pay."""
         search = {"p": first.given_p, "seed": rng}
         if self.held is None:
             return solve_globally(self.ddp, first.x, starts=starts, report=report, **search)
         hard = DDP(self.ocp, intervals=self.plain.intervals, substeps=self.substeps, dynamics=self.plain.dynamics,
-                   constraints="hard", between=False)
+                   between=False)
         found = solve_globally(hard, first.x, starts=starts, report=report, **search)
         if not found.success.any():
             return solve_globally(self.ddp, first.x, starts=starts, **search)
