@@ -34,7 +34,7 @@ ENOUGH = 0.25  # of the last round's violation: if more is left, rho grows
 LEAST, MOST, LARGEST = 1.0, 10.0, 1e7  # usual costs for a violation of one scale: rho at first, and ever
 SHARE = 10.0  # of the guess's cost, what rho makes of its violations at first
 RHO_GROWTH = 4.0
-ROUNDS = 5  # times max_iterations are the most that all rounds together take; one of them takes max_iterations
+ROUNDS = 5  # times max_iterations are the most that all rounds together take
 STALLS = 2  # rounds at the largest rho in which the violation does not halve: it cannot be held
 PRICE = 100.0  # usual costs for a violation of one scale over the whole horizon, or at its end, if they are elastic
 STIFF = 1e7  # usual costs, the weight of active rows in the sweep for gains
@@ -65,6 +65,7 @@ class Augmented(Work):
         self.last, self.stalls = np.full(B, np.inf), np.zeros(B, dtype=np.int64)
         self.cut = np.zeros(B, dtype=bool)  # where constraints are left between nodes, which were to be held there
         super().__post_init__()
+        self.most *= ROUNDS
         self._first_penalty()
         if d.constraints == "hard":
             outside = self._violations()[1].max(axis=1, initial=0.0) > TOLERATED
@@ -97,7 +98,6 @@ class Augmented(Work):
         kept = {name: getattr(self, name).copy() for name in self.kept}
         spent, before = self.iterations.copy(), self.margin
         self.margin, self.iterations[:], self.alpha[:] = margin, 0, 0.0
-        self.most[:] = self.ddp.settings.max_iterations
         self.rollout(rows, self.x, self.u, self.gain)  # the same plan, its merit with the margins
         self._take(rows)
         self.state[rows], self.last[rows], self.stalls[rows], self.mu[rows] = RUNNING, np.inf, 0, 0.0
@@ -156,8 +156,6 @@ class Augmented(Work):
         self.stalls[rows] += (rho >= most) & (worst > 0.5 * self.last[rows])
         self.state[rows[self.stalls[rows] >= STALLS]] = NOT_HELD
         self.last[rows] = worst
-        once = d.settings.max_iterations
-        self.most[rows] = np.minimum(self.iterations[rows] + once, ROUNDS * once)
         factor = np.ones(len(self.x0))
         factor[rows] = np.where(grows, np.minimum(RHO_GROWTH, most / rho), 1.0)
         d.kernel("nocl_multipliers", rows, d.intervals, self.margin, self.c, factor, self.y, self.penalty, self.J,
