@@ -53,6 +53,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
 SETTINGS["cartpole"] |= {"iterations": 2000}
 # many rival optima (first to the left or to the right, one swing or more); plans on 80 cost 1 % more
 SETTINGS["pendcart"] |= {"iterations": 2000, "intervals": 160, "branches": 2, "states": 400, "tails": 3000, "starts": 8}
+SETTINGS["lap"] |= {"iterations": 2000}
 SETTINGS["planar"] |= {"iterations": 2000, "intervals": 160}  # its plans on 80 cost 0.6 % more than the optimum
 
 

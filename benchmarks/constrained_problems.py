@@ -1,4 +1,4 @@
-"""The five problems that constrained policies are judged on, with their constraints in nocl's words."""
+"""The problems that constrained policies are judged on, with their constraints in nocl's words."""
 
 from __future__ import annotations
 
@@ -68,5 +68,29 @@ def pendcart() -> nocl.OCP:
                     path_constraints={"right": 0.5 - p, "left": p + 0.5})
 
 
+def lap() -> nocl.OCP:
+    """The least time for 2.5 m of acados' miniature race track (Kloeser), restated: the independent variable is the way
+    s along the middle of the track, so that the horizon is fixed, and time is what it costs. A small price keeps the
+    rates of throttle and steering apart from noise."""
+    s, n, al, v, D, de = (ca.SX.sym(name) for name in ("s", "n", "alpha", "v", "D", "delta"))
+    throttle, steering = ca.SX.sym("derD"), ca.SX.sym("derDelta")
+    m, C1, C2, Cm1, Cm2, Cr0, Cr2 = 0.043, 0.5, 15.5, 0.28, 0.05, 0.011, 0.006
+    bends = [(ca.tanh(8 * (s - begin)) - ca.tanh(8 * (s - end))) / 2 for begin, end in ((0.5, 1.2), (1.6, 2.2))]
+    kappa = 2.0 * bends[0] - 1.5 * bends[1]
+    force = (Cm1 - Cm2 * v) * D - Cr2 * v**2 - Cr0 * ca.tanh(5 * v)
+    s_dot = v * ca.cos(al + C1 * de) / (1 - kappa * n)
+    by_time = ca.vertcat(s_dot, v * ca.sin(al + C1 * de), v * C2 * de - kappa * s_dot, force / m * ca.cos(C1 * de),
+                         throttle, steering)
+    system = nocl.System(
+        "racecar", x=ca.vertcat(s, n, al, v, D, de), u=ca.vertcat(throttle, steering), xdot=by_time / s_dot,
+        lbu=[-10, -2], ubu=[10, 2], lbx=[-1, -0.12, -0.8, 0.3, -1, -0.4], ubx=[4, 0.12, 0.8, 3, 1, 0.4])
+    lateral = C2 * v**2 * de + force * ca.sin(C1 * de) / m
+    return nocl.OCP(
+        system, horizon=2.5, running=(1 + 1e-4 * throttle**2 + 5e-3 * steering**2) / s_dot, terminal=0.0,
+        initial_states=nocl.Gaussian(mean=[0, 0, 0, 1.0, 0.3, 0], std=[0.05, 0.02, 0.05, 0.1, 0.05, 0.02]),
+        state_bounds={"n": (-0.12, 0.12), "D": (-1, 1), "delta": (-0.4, 0.4)},
+        constraints={"lateral": (-4, lateral, 4), "along": (-4, force / m, 4)})
+
+
 PROBLEMS: dict[str, Callable[[], nocl.OCP]] = {
-    "cartpole": cartpole, "dubins": dubins, "point": point, "planar": planar, "pendcart": pendcart}
+    "cartpole": cartpole, "dubins": dubins, "point": point, "planar": planar, "pendcart": pendcart, "lap": lap}
