@@ -151,9 +151,9 @@ def test_margins_are_for_rows_that_the_map_does_not_hold():
     assert (held.first == 0).all()
     assert set(names[Held(ocp, learned=True).first > 0]) == {"speed"}  # f is not known there
     exceeded = np.full((10, len(names)), TOLERANCE * 0.7)
-    assert (held.next(held.first, exceeded) == 0).all()
+    assert (held.next(held.first, exceeded, exceeded) == 0).all()
     exceeded[:] = 0.01
-    assert set(names[held.next(held.first, exceeded) > 0]) == {"speed"}  # where the map fails
+    assert set(names[held.next(held.first, exceeded, exceeded) > 0]) == {"speed"}  # where the map fails
 
 
 def test_training_judges_as_the_judge_does():

@@ -202,13 +202,17 @@ def test_margins_make_up_for_what_is_exceeded_and_no_more():
     names = np.array(held.names)
     exceeded = np.full((100, len(names)), -0.3)
     exceeded[:, names == "speed"] = 4e-3
-    later = held.next(held.first, exceeded)
+    later = held.next(held.first, exceeded, exceeded[:0])
     np.testing.assert_allclose(later[names == "speed"], FIRST + 4e-3 - TOLERANCE / 2)
     assert (later[names == "thrust"] == 0).all()  # the output map holds it
+    kicked = np.full((100, len(names)), -0.3)
+    kicked[:3] = 1.0  # three kicks in a hundred may
+    kicked[3:6] = 0.02  # six may not
+    np.testing.assert_allclose(held.next(held.first, exceeded, kicked)[names == "speed"], FIRST + 0.02 - TOLERANCE / 2)
     exceeded[:] = -0.3
-    assert (held.next(later, exceeded) == 0).all()
+    assert (held.next(later, exceeded, kicked[6:]) == 0).all()
     exceeded[:] = np.inf
-    assert held.next(later, exceeded).max() == LARGEST
+    assert held.next(later, exceeded, kicked[6:]).max() == LARGEST
 
 
 def test_equations_have_no_margin():

@@ -1,9 +1,9 @@
 """Constraints in training: which plans are labels, what a policy violates, and the margins that make up for it.
 
 Labels hold the problem's constraints by margins more than they ask for, since a policy's own errors lie about the
-boundary: half of them outside. A margin is what all but SELDOM of held-out runs exceed the boundary by, measured under
-the margins before, row by row. Equations and what the output map holds (projection.py, barrier.py) have none, or,
-where the map fails, only then.
+boundary: half of them outside. A margin is what all but SELDOM of held-out runs exceed the boundary by, and all but
+SHAKEN of those from kicked states, measured under the margins before, row by row. Equations and what the output map
+holds (projection.py, barrier.py) have none, or, where the map fails, only then.
 
 Plans are elastic: where a state lies between the margin and the boundary, or a little outside, the label goes back in
 as fast as pays. Where no plan stays within LOST of what is held, the state is lost, and no label.
@@ -31,7 +31,8 @@ from nocl.support.checks import Array
 
 FIRST = 1e-3  # of a scale, the first margin of each row
 LARGEST = 0.05  # of a scale, the largest
-SELDOM = 0.03  # of held-out runs may exceed what a margin makes up for
+SELDOM = 0.01  # of held-out runs may exceed what a margin makes up for
+SHAKEN = 0.05  # of those from kicked states
 LOST = 0.01  # of a scale: a plan that leaves more is no label
 
 
@@ -99,11 +100,12 @@ class Held:
         lost = ~np.isfinite(x[:, -1]).all(axis=1)
         return np.where(lost[:, None], np.inf, -least / self.scales)
 
-    def next(self, margin: Array, exceeded: Array) -> Array:
+    def next(self, margin: Array, exceeded: Array, kicked: Array) -> Array:
         """The margins for labels of the next round; those of rows that the map holds stay, unless it fails."""
-        if not len(exceeded):
+        runs = [(over, seldom) for over, seldom in ((exceeded, SELDOM), (kicked, SHAKEN)) if len(over)]
+        if not runs:
             return margin
-        most = np.quantile(exceeded, 1 - SELDOM, axis=0, method="higher")
+        most = np.max([np.quantile(over, 1 - seldom, axis=0, method="higher") for over, seldom in runs], axis=0)
         more = np.where(self.guarded & (most <= TOLERANCE), 0.0, most - TOLERANCE / 2)
         return np.where(self.inward, np.clip(margin + more, 0.0, LARGEST), 0.0)
 

@@ -483,7 +483,7 @@ class Training:
             at = Problems(s.x[:, 0], s.t[:, 0], s.parameters)
             over.append(self.held.exceeded(self.policy, self.in_torch, at, self.steps * self.fine.intervals))
         return {**self.held.summary(over[0], "gap"), **self.held.summary(over[1], "kicked"),
-                "margin": self.margin.tolist(), "next_margin": self.held.next(self.margin, over[0]).tolist()}
+                "margin": self.margin.tolist(), "next_margin": self.held.next(self.margin, *over).tolist()}
 
     def _good_enough(self) -> bool:
         if self.round <= self.settings.least_rounds:
