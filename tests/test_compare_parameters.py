@@ -88,6 +88,7 @@ def test_each_run_is_that_of_the_problem_at_its_p(ocp, report):
     np.testing.assert_allclose(next(j for j in report.judged if j.name == "DDP").predicted, plan.cost, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_rows_have_columns_for_p(report, tmp_path):
     report.save(tmp_path, animation=False)
     with (tmp_path / "rows.csv").open() as file:

@@ -29,6 +29,7 @@ def grid(system: nocl.System, low: float, high: float) -> tuple[np.ndarray, np.n
     return x, rng.uniform(system.lbu, system.ubu, (200, 1))
 
 
+@pytest.mark.slow
 def test_members_disagree_where_there_are_no_data(ensemble):
     s = ensemble.system
     known, unknown = grid(s, s.lbx[0], 0), grid(s, 0.5 * s.ubx[0], s.ubx[0])

@@ -40,6 +40,7 @@ def bank():
     return NodeBank(ocp, solve_globally(DDP(ocp), STATES.sample(12, 0), starts=4, seed=0, progress=False))
 
 
+@pytest.mark.slow
 def test_what_is_left_of_a_solution_is_one(bank):
     rows, nodes = np.array([0, 3, 7]), np.array([10, 40, 60])
     guess, s = bank.tails(rows, nodes, 80), bank.solution

@@ -137,6 +137,7 @@ def test_stretched_axes_are_finest_at_the_goal_which_is_a_node():
         np.testing.assert_allclose(np.asarray(axis.slope(axis.nodes)), 0.3 * np.cosh(axis.y), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_upwind_hamiltonian_is_the_minimum_over_controls_each_with_its_own_side():
     """By brute force over controls, at random states and differences; with equal sides it is the Hamiltonian itself."""
     ocp = nocl.load_ocp("dubins")

@@ -36,6 +36,7 @@ def test_they_are_those_expressions_scaled():
     assert own_features(ocp, None) is None
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")
 def test_a_controller_sees_them_and_is_saved_and_exported(tmp_path):
     ocp = nocl.load_ocp("double_integrator")

@@ -250,6 +250,7 @@ def robust(ocp):
     return robustness(ocp, methods, ocp.initial_states.sample(2, 4), mass_variants(ocp), settings, progress=False)
 
 
+@pytest.mark.slow
 def test_every_scenario_has_every_method(robust):
     assert [s.name for s in robust.scenarios] == ["undisturbed", "noise", "kicks", "held", "late", "masses +20 %",
                                                   "masses -20 %", "controls 20 % weaker", "real time"]

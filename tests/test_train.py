@@ -145,6 +145,7 @@ def test_pendulum_swings_up():
     assert np.mean(np.abs(cnd.value(x0) / best.cost - 1)) < 0.03
 
 
+@pytest.mark.slow
 def test_same_seed_same_controller_and_others_differ():
     ocp = nocl.load_ocp("pendulum")
     runs = [nocl.train(ocp, settings=replace(TINY, rounds=1), seed=seed, progress=False) for seed in (3, 3, 4)]

@@ -24,6 +24,7 @@ def blocks() -> list[str]:
     return re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
 
 
+@pytest.mark.slow
 def test_the_users_view_runs(tmp_path, monkeypatch):
     pytest.importorskip("l4casadi")
     monkeypatch.chdir(tmp_path)
