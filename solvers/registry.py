@@ -20,7 +20,8 @@ class Options:
 
     intervals: int = 80  # of a plan's held controls
     seed: int = 0  # of what is random in the method
-    substeps: int | None = None  # Runge-Kutta steps in each interval; None: chosen by what is solved first
+    substeps: int | None = None  # steps in each interval; None: chosen by what is solved first
+    integrator: str | None = None  # of these steps; None: chosen with them
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ def asked(ocp: OCP) -> str:
     return "--p " + ",".join(f"{name}={value:g}" for name, value in values)
 
 
-PLANS = ("intervals", "seed", "substeps")  # what plans take
+PLANS = ("intervals", "seed", "substeps", "integrator")  # what plans take
 
 METHODS: dict[str, Method] = {method.name: method for method in (
     Method("cnd", "CND", "the run's own controller"),

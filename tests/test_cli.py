@@ -270,8 +270,10 @@ def test_solve_takes_the_substeps_that_the_plant_asks_for(here, capsys, solver):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert main([*command, "--substeps", "16", "--out", "given"]) == 0
-    with np.load(f"given/solutions/{solver}.npz") as found:
-        np.testing.assert_allclose(found["cost"], cost, rtol=1e-3)
+        assert main([*command, "--substeps", "2", "--integrator", "radau", "--out", "implicit"]) == 0
+    for folder in ("given", "implicit"):
+        with np.load(f"{folder}/solutions/{solver}.npz") as found:
+            np.testing.assert_allclose(found["cost"], cost, rtol=1e-3)
 
 
 @pytest.mark.parametrize("solver", ["nmpc", "ddp"])

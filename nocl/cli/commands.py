@@ -114,9 +114,11 @@ def parser() -> argparse.ArgumentParser:
     _add(sub, "problem", "p", "out", "seed", "n", "intervals")
     sub.add_argument("--solver", choices=registry.solvers(), default="nmpc", metavar="NAME",
                      help=f"default: nmpc; {_told_of(registry.solvers())}")
-    sub.add_argument("--substeps", type=arguments.count, metavar="S", help="Runge-Kutta steps in each interval of a "
-                     "plan; default: 1, or as many as the first solutions ask for, held against the plant on far "
-                     "shorter steps")
+    sub.add_argument("--substeps", type=arguments.count, metavar="S", help="steps in each interval of a plan; "
+                     "default: 1, or as many as the first solutions ask for, held against the plant on far shorter "
+                     "steps")
+    sub.add_argument("--integrator", choices=("rk4", "radau"), help="of these steps: Runge and Kutta's, or implicit "
+                     "ones; default: the former, or the latter where they would be too many")
     sub.add_argument("--workers", type=arguments.workers, default="auto", metavar="W",
                      help="processes or threads of the solver, auto, or a Dask scheduler's tcp://...; default: auto")
     sub = command("export", _export, "write a run's controller, value function and dynamics, proven equal to it")
@@ -284,7 +286,7 @@ def _solve(args: argparse.Namespace) -> None:
 
     ocp, out = _problem(args)
     with alone(out / "solutions"):
-        options = registry.Options(args.intervals, args.seed, args.substeps)
+        options = registry.Options(args.intervals, args.seed, args.substeps, args.integrator)
         solve(ocp, out / "solutions", args.solver, args.n, options, args.workers, args.p)
 
 

@@ -24,7 +24,7 @@ from nocl.definition import measured
 from nocl.definition.constraints import TOLERANCE
 from nocl.definition.ocp import OCP
 from nocl.definition.sampling import own_numbers
-from nocl.definition.substeps import FINE
+from nocl.definition.substeps import FINE, RADAU
 from nocl.judge.simulation import simulate
 from nocl.nets import FeatureNet
 from nocl.solvers.cnd.controller import CND
@@ -60,6 +60,9 @@ def check_law(ocp: OCP, dynamics: Any, settings: TrainSettings) -> None:
     if not ocp.held_at_end:
         raise ValueError(f"train: the problem on {name!r} has a free horizon and no terminal constraints, so that a "
                          "law would not know where it ends; expected terminal_constraints, or a number as horizon")
+    if settings.integrator == RADAU:
+        raise ValueError(f"train: the problem on {name!r} has a free horizon, and its law is trained by Runge-Kutta "
+                         "steps; expected integrator='auto' or 'rk4'")
     if settings.minutes is not None:
         raise ValueError(f"train: minutes are for problems whose horizon is a number, and that of {name!r} is free; "
                          "expected none: fewer iterations, tails and visits take less time")

@@ -11,6 +11,7 @@ import torch
 
 from nocl import hjb
 from nocl.definition.ocp import OCP
+from nocl.definition.substeps import INTEGRATORS
 from nocl.nets import ACTIVATIONS, FeatureNet
 from nocl.support import checks
 from nocl.support.fields import Checked, Scaled, choice, coefficients, count, flag, nonnegative, positive, widths
@@ -18,6 +19,7 @@ from nocl.support.fingerprint import fingerprint, json_text
 from nocl.translate.instructions import to_data
 from nocl.translate.rk4 import rk4_cost
 
+AUTO = "auto"
 STEPS: dict[str, hjb.Step] = {"rk4": rk4_cost, "euler": hjb.euler_cost}
 
 
@@ -55,8 +57,10 @@ class TrainSettings(Scaled):
         return cls(**{**usual, **more, **changes})
 
     intervals: int = count(80, "held controls of each labelled solution")
-    substeps: int | None = count(None, "RK4 steps in each interval", none="as many as a few solutions ask for, held "
+    substeps: int | None = count(None, "steps in each interval", none="as many as a few solutions ask for, held "
                                  "against the plant on far shorter steps; the card says how many")
+    integrator: str = choice(AUTO, "of these steps: Runge-Kutta's, implicit ones (Radau) of the exact f, or, auto, "
+                             "implicit ones where explicit ones would be too many", (AUTO, *INTEGRATORS))
     seeds: int = count(20, "initial states solved globally, from cold starts")
     starts: int = count(16, "cold starts of each")
     states: int = count(400, "further initial states, solved from their neighbours", least=0)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from nocl.data import Solution
 from nocl.definition.ocp import OCP
 from nocl.definition.sampling import own_numbers
-from nocl.definition.substeps import FINE
+from nocl.definition.substeps import FINE, RADAU
 from nocl.judge.simulation import simulate
 from nocl.nets import MLP, FeatureNet
 from nocl.solvers.cnd.laws import FAR, LawTraining
@@ -58,6 +58,9 @@ def check_stationary(ocp: OCP, dynamics: Any, settings: TrainSettings) -> None:
                          f"{', '.join(ocp.constraint_names)}; expected U alone: give it a number as horizon, or leave "
                          "them out, ocp.unconstrained")
     ocp.refuse_parameters("train on an INFINITE horizon")
+    if settings.integrator == RADAU:
+        raise ValueError(f"train: the problem on {name!r} has an INFINITE horizon, and its law is trained by "
+                         "Runge-Kutta steps; expected integrator='auto' or 'rk4'")
     if settings.minutes is not None or settings.control_dt or settings.branches > 1:
         raise ValueError("train: minutes, control_dt and branches are for problems whose horizon is a number; expected "
                          "none of them: fewer iterations, tails and visits take less time")

@@ -31,7 +31,7 @@ import torch
 from nocl.data import Solution
 from nocl.definition.ocp import OCP
 from nocl.definition.sampling import own_numbers
-from nocl.definition.substeps import FINE
+from nocl.definition.substeps import FINE, RADAU, RK4, Steps
 from nocl.exports import parity
 from nocl.nets import FeatureNet
 from nocl.solvers.cnd.controller import CND
@@ -55,7 +55,7 @@ from nocl.solvers.cnd.regression.labels import (
     visited,
 )
 from nocl.solvers.cnd.regression.regress import fit_net, policy_loss
-from nocl.solvers.cnd.settings import TrainSettings, identity
+from nocl.solvers.cnd.settings import AUTO, TrainSettings, identity
 from nocl.solvers.cnd.stationary import StationaryTraining, check_stationary
 from nocl.solvers.cnd.validate import (
     advice,
@@ -76,7 +76,7 @@ from nocl.solvers.cnd.value import ValueLabels, on_fine_grid, value_loss, value_
 from nocl.solvers.ddp.bank import SolutionBank, better, extend
 from nocl.solvers.ddp.global_search import OnMessage, solve_globally
 from nocl.solvers.ddp.opinion import second_opinion
-from nocl.solvers.ddp.solver import DDP, substeps_for
+from nocl.solvers.ddp.solver import DDP, steps_for
 from nocl.support import checks, store
 from nocl.support.budget import ENDLESS, Budget
 from nocl.support.checks import Array
@@ -187,6 +187,18 @@ def _expect(settings: Any, kind: Any) -> Any:
     return settings or kind()
 
 
+def _steps(ocp: OCP, dynamics: LearnedDynamics | None, s: TrainSettings) -> Steps:
+    """Those of an interval; chosen by a few solutions, explicit ones alone on learned dynamics."""
+    if dynamics is not None and s.integrator == RADAU:
+        raise ValueError("train: integrator='radau' makes steps of the exact f, and training is on learned dynamics; "
+                         "expected 'auto' or 'rk4', with more substeps or intervals where the plant is fast")
+    usual = None if dynamics is None else RK4
+    integrator = usual if s.integrator == AUTO else s.integrator
+    if s.substeps:
+        return Steps(integrator or RK4, s.substeps)
+    return steps_for(ocp, dynamics, s.intervals, FINE, integrator)
+
+
 class Training:
     """One run of the default method; its state between rounds is what a checkpoint holds."""
 
@@ -197,12 +209,14 @@ class Training:
         self.begin = time.monotonic() if begin is None else begin  # what the budget counts from
         self.ocp, self.settings, self.seed = ocp, settings, seed
         self.learned = dynamics is not None
-        self.in_torch = InTorch(ocp, dynamics)
-        self.substeps = settings.substeps or substeps_for(ocp, dynamics, settings.intervals, FINE)
+        self.integrator, self.substeps = _steps(ocp, dynamics, settings)
+        self.in_torch = InTorch(ocp, dynamics, self.integrator)
         self.held = Held(ocp, self.learned) if ocp.is_held else None
-        self.plain = DDP(ocp, intervals=settings.intervals, substeps=self.substeps, dynamics=dynamics,
-                         constraints="hard" if self.held is None else "elastic")
-        self.fine = DDP(ocp, intervals=4 * settings.intervals, substeps=-(-self.substeps // 4), dynamics=dynamics)
+        same: dict[str, Any] = {"dynamics": dynamics, "integrator": self.integrator}
+        self.plain = DDP(ocp, intervals=settings.intervals, substeps=self.substeps,
+                         constraints="hard" if self.held is None else "elastic", **same)
+        finer = self.substeps if self.integrator == RADAU else -(-self.substeps // 4)  # layers are as thin as they were
+        self.fine = DDP(ocp, intervals=4 * settings.intervals, substeps=finer, **same)
         self.solved: list[Solution] = []  # what the labels are of, where constraints have margins that may change
         self._inside(None if self.held is None else self.held.first)
         self.checkpoint = None if out is None else Path(out) / CHECKPOINT
@@ -343,7 +357,7 @@ class Training:
         if self.held is None:
             return solve_globally(self.ddp, first.x, starts=starts, report=report, **search)
         hard = DDP(self.ocp, intervals=self.plain.intervals, substeps=self.substeps, dynamics=self.plain.dynamics,
-                   between=False)
+                   integrator=self.integrator, between=False)
         found = solve_globally(hard, first.x, starts=starts, report=report, **search)
         if not found.success.any():
             return solve_globally(self.ddp, first.x, starts=starts, **search)
@@ -565,6 +579,7 @@ class Training:
                 "fitting_seconds": round(self.fitting, 1),  # of these, fits of networks; the others solve problems
                 "fitting_cpu_seconds": round(self.fitting_cpu, 1),
                 "dynamics_evaluations": self._evaluations(), "substeps": self.substeps,
+                "integrator": self.integrator,
                 **({"second_opinion": self.opinion} if self.opinion else {}),
                 "settings": asdict(self.settings), **own, **self._time_card(), "history": self.history,
                 "value": self.value_card}

@@ -112,9 +112,10 @@ class GlobalDDP:
                               progress=progress)
 
 
-def global_ddp(ocp: OCP, intervals: int, seed: int, substeps: int | None = None) -> GlobalDDP:
+def global_ddp(ocp: OCP, intervals: int, seed: int, substeps: int | None = None,
+               integrator: str | None = None) -> GlobalDDP:
     """DDP from everywhere, as the command line makes it."""
-    return GlobalDDP(DDP(ocp, intervals=intervals, substeps=substeps), seed=seed)
+    return GlobalDDP(DDP(ocp, intervals=intervals, substeps=substeps, integrator=integrator), seed=seed)
 
 
 class _Kept(Search):

@@ -379,9 +379,10 @@ def _known(solver: str) -> bool:
         return False
 
 
-def closed_loop(ocp: OCP, intervals: int, seed: int, substeps: int | None = None) -> Loop:
+def closed_loop(ocp: OCP, intervals: int, seed: int, substeps: int | None = None,
+                integrator: str | None = None) -> Loop:
     """NMPC as feedback, as the command line makes it."""
-    return NMPC(ocp, intervals, seed=seed, substeps=substeps).controller()
+    return NMPC(ocp, intervals, seed=seed, substeps=substeps, integrator=integrator).controller()
 
 
 @dataclass(frozen=True)

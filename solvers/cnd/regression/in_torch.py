@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from nocl.definition.ocp import OCP
+from nocl.definition.substeps import RADAU, RK4
+from nocl.solvers.cnd.regression.implicit import Implicit
 from nocl.support.checks import Array
 from nocl.translate.rk4 import rk4_cost
 from nocl.translate.torch_functions import to_torch
@@ -20,10 +22,12 @@ class InTorch:
     """f, L and G of a problem as torch functions of what they take among (x, u, t, p).
 
     dynamics : (x, u[, t][, p of the system]) -> xdot in torch, as learned, in place of the exact f
+    integrator : of its steps; implicit ones are those of the exact f
     """
 
-    def __init__(self, ocp: OCP, dynamics: Function | None = None) -> None:
+    def __init__(self, ocp: OCP, dynamics: Function | None = None, integrator: str = RK4) -> None:
         self.ocp, self.timed = ocp, ocp.uses_time
+        self.implicit = Implicit(ocp) if integrator == RADAU else None
         names = ocp.functions.arguments.names
         self.takes = {"f": names if dynamics is None else ocp.system.arguments.names, "L": names,
                       "G": ocp.functions.end.names}
@@ -34,9 +38,10 @@ class InTorch:
         """The problem for rows with parameters p [B, np]."""
         return Rows(self, torch.from_numpy(p))
 
-    def call(self, name: str, **values: Any) -> Tensor:
+    def call(self, name: str, function: Function | None = None, **values: Any) -> Tensor:
+        """The function of that name, or another one that takes the same."""
         given = [values[n][:, :self.n_p[name]] if n == "p" else values[n] for n in self.takes[name]]
-        return self.function[name](*given)
+        return (function or self.function[name])(*given)
 
 
 class Rows:
@@ -59,11 +64,23 @@ class Rows:
     def G(self, x: Tensor) -> Tensor:
         return self.of.call("G", x=x, p=self._p)
 
+    def of_f(self, function: Function, x: Tensor, u: Tensor, t: Tensor | None = None) -> Tensor:
+        """A function that takes what f does."""
+        return self.of.call("f", function, x=x, u=u, t=t, p=self._p)
+
+    def repeated(self, n: int) -> Rows:
+        """Each row n times."""
+        return Rows(self.of, self._p.repeat_interleave(n, dim=0))
+
     def interval(self, x: Tensor, u: Tensor, t: Any, h: Any, substeps: int = 1) -> tuple[Tensor, Tensor]:
         """(the states after intervals of length h from t on with u held, the integral of L over them)."""
+        if self.of.implicit is not None:
+            return self.of.implicit.interval(self, x, u, t, h, substeps)
         return rk4_cost(self.f, self.L, x, u, h, substeps, t if self.of.timed else None)
 
     def after(self, x: Tensor, u: Tensor, t: Any, h: Any, substeps: int = 1) -> Tensor:
         """The states alone."""
+        if self.of.implicit is not None:
+            return self.of.implicit.interval(self, x, u, t, h, substeps)[0]
         end, _ = rk4_cost(self.f, lambda *_: 0.0, x, u, h, substeps, t if self.of.timed else None)
         return end

@@ -245,6 +245,7 @@ def continuous_cost(policy: Policy, torch_ocp: InTorch, at: Problems, steps: int
 
 def continuous_run(policy: Policy, torch_ocp: InTorch, at: Problems, steps: int) -> tuple[Array, Array, Array]:
     """The policy as continuous feedback from there, by RK4 on (x, t, cost): J [B], x [B, steps+1, nx], t [B, steps+1].
+    Where steps are implicit, the control of each step is the policy's at its middle: off by its length squared.
     """
     n, here = at.x.shape[1], torch_ocp.at(at.p)
 
@@ -253,12 +254,18 @@ def continuous_run(policy: Policy, torch_ocp: InTorch, at: Problems, steps: int)
         u = policy(x, t, *here.p)
         return torch.cat([here.f(x, u, t), torch.ones_like(t), here.L(x, u, t)], dim=1)
 
+    def implicit(z: Tensor) -> Tensor:
+        x, t, J = z[:, :n], z[:, n:n + 1], z[:, n + 1:]
+        middle = here.after(x, policy(x, t, *here.p), t, h / 2)
+        end, cost = here.interval(x, policy(middle, t + h / 2, *here.p), t, h)
+        return torch.cat([end, t + h, J + cost], dim=1)
+
     z = torch.from_numpy(np.column_stack([at.x, at.t, np.zeros(len(at))]))
     h = torch.from_numpy((torch_ocp.ocp.horizon - at.t) / steps)[:, None]
     path = [z]
     with torch.no_grad():
         for _ in range(steps):
-            path.append(rk4(closed_loop, path[-1], None, h))
+            path.append(implicit(path[-1]) if torch_ocp.implicit else rk4(closed_loop, path[-1], None, h))
         J = (path[-1][:, n + 1] + here.G(path[-1][:, :n])[:, 0]).numpy()
     way = torch.stack(path, dim=1).numpy()
     return J, np.ascontiguousarray(way[..., :n]), np.ascontiguousarray(way[..., n])
