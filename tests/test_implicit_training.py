@@ -48,7 +48,7 @@ def test_where_newton_finds_nothing_a_row_is_lost_and_the_others_go_on():
     """x' = u - sqrt(x) has no slope below 0."""
     x, u = ca.SX.sym("x"), ca.SX.sym("u")
     system = nocl.System("tank", x=x, u=u, xdot=u - ca.sqrt(x), lbu=[0], ubu=[1], lbx=[0.1], ubx=[3])
-    ocp = nocl.OCP(system, horizon=1.0, running=u**2, terminal=x**2, initial_states=nocl.Uniform([0.2], [2]))
+    ocp = nocl.OCP(system, horizon=1.0, running=x**2, terminal=x**2, initial_states=nocl.Uniform([0.2], [2]))
     with torch.no_grad():
         end, cost = InTorch(ocp, integrator="radau").at(np.zeros((2, 0))).interval(
             torch.tensor([[-0.2], [1.0]], dtype=torch.float64), torch.zeros(2, 1, dtype=torch.float64), 0.0, 1.0)
