@@ -88,7 +88,7 @@ def lap() -> nocl.OCP:
     return nocl.OCP(
         system, horizon=2.5, running=(1 + 1e-4 * throttle**2 + 5e-3 * steering**2) / s_dot, terminal=0.0,
         initial_states=nocl.Gaussian(mean=[0, 0, 0, 1.0, 0.3, 0], std=[0.05, 0.02, 0.05, 0.1, 0.05, 0.02]),
-        state_bounds={"n": (-0.12, 0.12), "D": (-1, 1), "delta": (-0.4, 0.4)},
+        state_bounds={"n": (-0.12, 0.12), "v": (0.3, None), "D": (-1, 1), "delta": (-0.4, 0.4)},  # s_dot > 0
         constraints={"lateral": (-4, lateral, 4), "along": (-4, force / m, 4)})
 
 

@@ -276,6 +276,12 @@ def test_solve_takes_the_substeps_that_the_plant_asks_for(here, capsys, solver):
             np.testing.assert_allclose(found["cost"], cost, rtol=1e-3)
 
 
+@pytest.mark.parametrize("option", ["--substeps=2", "--integrator=radau"])
+def test_solve_refuses_steps_for_a_method_without(here, capsys, option):
+    assert main(["solve", "double_integrator", "--solver", "lqr", "--n", "2", option, "--out", "new"]) == 2
+    assert f"--solver lqr makes no plans on a grid and takes no {option.split('=')[0]}" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("solver", ["nmpc", "ddp"])
 def test_solve_fails_where_nothing_was_solved(here, capsys, solver):
     """Braking from 1.5 takes 1.125, and the wall is 0.5 away."""

@@ -205,7 +205,7 @@ def test_the_baselines_are_held_controls_and_lqr():
     report = compare(free, {"PD": PD, "LQR": LQR(free)}, x0=[[1.0, 0.0]], progress=False)
     np.testing.assert_array_equal(report.base, lqr)
     assert np.isnan(report.missed).all()  # LQR is a method here: nothing is to be gained over it
-    assert "On 1 of 1 state such a baseline costs as little as the best method" in tables(report)["summary"].note
+    assert "On 1 of 1 state such a baseline is as good as the best method." in tables(report)["summary"].note
     report = compare(free, {"PD": PD}, x0=[[1.0, 0.0]], progress=False)
     assert report.cost[0, 0] > 1.01 * report.base[0]
     assert "On 1 of 1 state no method costs as little as such a baseline" in tables(report)["summary"].note

@@ -30,7 +30,7 @@ from nocl.judge.runs import Simulation
 from nocl.support.checks import Array
 
 REFERENCE = "reference"  # the name of a yardstick among the methods: its speed is no method's
-ALIKE = 1e-3  # of a cost: a baseline is as good as a method
+ALIKE = 0.1  # per cent of a cost: a baseline is as good as a method
 NOISE = 1e-9  # of a cost: gains that are less are the judge's rounding
 BASELINE = "a simple baseline"  # a control that is held, or LQR: see comparisons/baselines.py
 WIDTH = 118  # characters of a line in the terminal
@@ -347,15 +347,14 @@ def _none_better(report: Results, n: int) -> list[str]:
     base, least = report.base, report.cost.min(axis=0)
     assert base is not None
     with np.errstate(invalid="ignore"):
-        equal = report.counted & (base <= report.best) & (least - base <= ALIKE * np.abs(base))
-        behind = report.counted & (base <= report.best) & ~equal
+        best = report.counted & (base <= report.best)
+        equal = best & (per_cent(least - base, base, usual_sizes(report.ocp).cost) <= ALIKE)
     said = []
     if equal.any():
-        said.append(f"On {int(equal.sum())} of {count(n, 'state')} such a baseline costs as little as the best method: "
-                    "nothing is to be gained there.")
-    if behind.any():
-        said.append(f"On {int(behind.sum())} of {count(n, 'state')} no method costs as little as such a baseline, "
-                    "whose cost is the best known there, and may be far from the optimum.")
+        said.append(f"On {int(equal.sum())} of {count(n, 'state')} such a baseline is as good as the best method.")
+    if (best & ~equal).any():
+        said.append(f"On {int((best & ~equal).sum())} of {count(n, 'state')} no method costs as little as such a "
+                    "baseline, whose cost is the best known there, and may be far from the optimum.")
     return said
 
 

@@ -118,7 +118,7 @@ def parser() -> argparse.ArgumentParser:
                      "default: 1, or as many as the first solutions ask for, held against the plant on far shorter "
                      "steps")
     sub.add_argument("--integrator", choices=("rk4", "radau"), help="of these steps: Runge and Kutta's, or implicit "
-                     "ones; default: the former, or the latter where they would be too many")
+                     "ones; default: the former, or without --substeps the latter where they would be too many")
     sub.add_argument("--workers", type=arguments.workers, default="auto", metavar="W",
                      help="processes or threads of the solver, auto, or a Dask scheduler's tcp://...; default: auto")
     sub = command("export", _export, "write a run's controller, value function and dynamics, proven equal to it")
@@ -285,6 +285,11 @@ def _solve(args: argparse.Namespace) -> None:
     from nocl.cli.run_folder import solve  # torch
 
     ocp, out = _problem(args)
+    takes = registry.find(args.solver).takes
+    given = [name for name in ("substeps", "integrator") if getattr(args, name) is not None]
+    if ignored := [name for name in given if name not in takes]:
+        raise ValueError(f"nocl solve: --solver {args.solver} makes no plans on a grid and takes no --{ignored[0]}: "
+                         "leave it out")
     with alone(out / "solutions"):
         options = registry.Options(args.intervals, args.seed, args.substeps, args.integrator)
         solve(ocp, out / "solutions", args.solver, args.n, options, args.workers, args.p)

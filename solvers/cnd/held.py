@@ -31,7 +31,7 @@ from nocl.support.checks import Array
 
 FIRST = 1e-3  # of a scale, the first margin of each row
 LARGEST = 0.05  # of a scale, the largest
-SELDOM = 0.01  # of held-out runs may exceed what a margin makes up for
+SELDOM = 0.01  # of held-out runs may exceed what a margin makes up for, but at least one
 SHAKEN = 0.05  # of those from kicked states
 LOST = 0.01  # of a scale: a plan that leaves more is no label
 
@@ -102,10 +102,10 @@ class Held:
 
     def next(self, margin: Array, exceeded: Array, kicked: Array) -> Array:
         """The margins for labels of the next round; those of rows that the map holds stay, unless it fails."""
-        runs = [(over, seldom) for over, seldom in ((exceeded, SELDOM), (kicked, SHAKEN)) if len(over)]
+        runs = [(over, share) for over, share in ((exceeded, SELDOM), (kicked, SHAKEN)) if len(over)]
         if not runs:
             return margin
-        most = np.max([np.quantile(over, 1 - seldom, axis=0, method="higher") for over, seldom in runs], axis=0)
+        most = np.max([_all_but(share, over) for over, share in runs], axis=0)
         more = np.where(self.guarded & (most <= TOLERANCE), 0.0, most - TOLERANCE / 2)
         return np.where(self.inward, np.clip(margin + more, 0.0, LARGEST), 0.0)
 
@@ -117,3 +117,9 @@ class Held:
             each[title] = max(each.get(title, 0.0), float(worst[:, row].max(initial=0.0)))
         share = float((worst.max(axis=1, initial=0.0) > TOLERANCE).mean()) if len(worst) else float("nan")
         return {f"{name}_violating": share, f"{name}_worst": each}
+
+
+def _all_but(share: float, over: Array) -> Array:
+    """What all but a share of the runs [B, rows] stay below, or all but one, row by row."""
+    out = max(int(share * len(over)), 1)
+    return np.asarray(np.sort(over, axis=0)[max(len(over) - 1 - out, 0)])

@@ -60,7 +60,8 @@ class TrainSettings(Scaled):
     substeps: int | None = count(None, "steps in each interval", none="as many as a few solutions ask for, held "
                                  "against the plant on far shorter steps; the card says how many")
     integrator: str = choice(AUTO, "of these steps: Runge-Kutta's, implicit ones (Radau) of the exact f, or, auto, "
-                             "implicit ones where explicit ones would be too many", (AUTO, *INTEGRATORS))
+                             "implicit ones where substeps are left to nocl and explicit ones would be too many",
+                             (AUTO, *INTEGRATORS))
     seeds: int = count(20, "initial states solved globally, from cold starts")
     starts: int = count(16, "cold starts of each")
     states: int = count(400, "further initial states, solved from their neighbours", least=0)

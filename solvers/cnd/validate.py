@@ -82,7 +82,8 @@ def gap(policy: Policy, torch_ocp: InTorch, best: Solution, unit: float = 0.0, s
 
 
 def own_feedback(plans: Solution, steps: int) -> Policy:
-    """Each plan itself as feedback in continuous time, for `steps` RK4 steps from where the plans start, row by row.
+    """Each plan itself as feedback in continuous time, for `steps` steps from where the plans start, row by row; each
+    row as often as the stages of an implicit step ask for it.
 
     Controls by monotone cubics through the middles of the intervals, where labels stand, the plan's states by cubic
     splines through its nodes, its gains held: what a network would be that had learned the labels, and no more.
@@ -96,8 +97,18 @@ def own_feedback(plans: Solution, steps: int) -> Policy:
     t0, left = (torch.from_numpy(z.copy()) for z in (plans.t[:, 0], plans.t[:, -1] - plans.t[:, 0]))
 
     def policy(state: Tensor, t: Tensor, *_: Tensor) -> Tensor:
-        k = int(torch.round((t[0, 0] - t0[0]) / left[0] * 2 * steps).clamp(0, 2 * steps))
-        return u[:, k] + torch.einsum("bij,bj->bi", gain[:, k], state - x[:, k])
+        rows = torch.arange(len(u)).repeat_interleave(len(state) // len(u))
+        place = ((t[:, 0] - t0[rows]) / left[rows] * 2 * steps).clamp(0, 2 * steps)
+        k = torch.round(place).long()
+        on = (k - place).abs() < 1e-6  # Runge and Kutta's stages are
+        below = torch.where(on, k, place.long())
+        share = torch.where(on, 0.0, place - below)[:, None]
+        above = (below + 1).clamp(max=2 * steps)
+
+        def between(z: Tensor) -> Tensor:
+            return z[rows, below] + share * (z[rows, above] - z[rows, below])
+
+        return between(u) + torch.einsum("bij,bj->bi", gain[rows, below], state - between(x))
 
     return policy
 

@@ -80,8 +80,8 @@ def second_opinion(ddp: DDP, plans: Solution, states: int = STATES, starts: int 
 def _nmpc(ddp: DDP, some: Solution, starts: int) -> Solution:
     """The best of NMPC from DDP's plans and from starts of its own, on DDP's grid."""
     held = "soft" if ddp.constraints == "soft" else "hard"
-    nmpc = NMPC(without_kinks(ddp.ocp), ddp.intervals, dynamics=ddp.dynamics, substeps=ddp.substeps, passes=0,
-                constraints=held, between=bool(ddp.between), time_limit=PATIENCE)
+    nmpc = NMPC(without_kinks(ddp.ocp), ddp.intervals, dynamics=ddp.dynamics, substeps=ddp.substeps,
+                integrator=ddp.integrator, passes=0, constraints=held, between=bool(ddp.between), time_limit=PATIENCE)
     with warnings.catch_warnings():  # of the grid DDP has told
         warnings.simplefilter("ignore")
         return nmpc.solve(some.x[:, 0], [some], p=some.p, starts=starts, workers=1, progress=False)

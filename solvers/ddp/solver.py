@@ -232,6 +232,7 @@ class DDP:
         cost, controls = np.empty(len(x0)), np.empty((len(x0), self.intervals, self.ocp.system.nu))
         for batch in pieces(brief, x0, self._start_times(t0, len(x0)), self._guesses(len(x0), **guess), False, p):
             work = brief._work(batch.x0, batch.t0, batch.guess, batch.p)
+            work.most[:] = iterations
             work.descend()
             here = slice(batch.first, batch.first + batch.size)
             cost[here], controls[here] = work.promise(), work.u

@@ -34,7 +34,7 @@ GROWTH, DECAY = 4.0, 2.0  # of mu, after a failure and a success: against 8 and 
 class DDPSettings(Checked):
     """When to stop, and how steps are damped."""
 
-    max_iterations: int = count(200, "of the descent")
+    max_iterations: int = count(200, "of the descent; 5 times as many where constraints are held")
     tolerance: float = positive(1e-10, "stop when the predicted decrease of J is below tolerance * |J|, or 1e-15 of "
                                 "the usual cost")
     smallest_step: float = positive(2.0**-12, "of the line search", most=1)

@@ -1,10 +1,12 @@
-"""Implicit steps of batches in torch, for plants whose explicit ones would be too short: Radau IIA, controls held.
+"""Implicit steps of batches in torch, for plants whose explicit ones would be too short: Radau IIA.
 
-The same stages as nocl/translate/radau.py and csrc/radau.h have, by Newton's method on all rows at once.
+Controls are held, as in nocl/translate/radau.py and csrc/radau.h, or a policy's at each stage: then its slope is part
+of Newton's method, so that feedback on what is fast is followed too. All rows of a piece are solved at once.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cached_property
 from typing import Any
 
@@ -14,12 +16,20 @@ from torch import Tensor
 
 from nocl.definition.ocp import OCP
 from nocl.definition.scales import usual_sizes
-from nocl.translate.radau import ITERATIONS, REACH, SETTLED, STAGES, WEIGHT
+from nocl.translate.radau import ITERATIONS, LEFT, REACH, SETTLED, STAGES, WEIGHT
 from nocl.translate.torch_functions import to_torch
+
+ROWS = 4096  # solved at once: what Newton's matrices take grows with them
+Policy = Callable[..., Tensor]
+Field = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]  # x, t of stages -> u, f and its slope in x
 
 
 class Implicit:
-    """Steps of an OCP's exact f; rows where Newton's method does not converge become NaN."""
+    """Steps of an OCP's exact f; rows where Newton's method does not converge become NaN.
+
+    rows : the problem at the rows' parameters, an in_torch.Rows
+    h, t : length and beginning of the intervals, [B, 1] or a number
+    """
 
     def __init__(self, ocp: OCP) -> None:
         self.ocp, self.nx = ocp, ocp.system.nx
@@ -27,43 +37,80 @@ class Implicit:
         self.weight, self.reach = torch.from_numpy(WEIGHT), torch.from_numpy(REACH)
 
     @cached_property
-    def slope(self) -> Any:
-        """df/dx of rows, in torch: [B, nx nx], column by column."""
+    def slopes(self) -> Any:
+        """df/d(x, u) of rows, in torch: [B, nx (nx + nu)], column by column."""
         f = self.ocp.functions.f
         given = f.sx_in()
-        return to_torch(ca.Function("f_x", given, [ca.vec(ca.densify(ca.jacobian(f(*given), given[0])))]))
+        slopes = ca.densify(ca.jacobian(f(*given), ca.vertcat(*given[:2])))
+        return to_torch(ca.Function("slopes", given, [ca.vec(slopes)]))
 
     def interval(self, rows: Any, x: Tensor, u: Tensor, t: Any, h: Any, substeps: int) -> tuple[Tensor, Tensor]:
-        """(the states [B, nx] after intervals of length h [B, 1] or a number, the integrals [B, 1] of L over them).
+        """(the states [B, nx] after intervals with u [B, nu] held, the integrals [B, 1] of L over them)."""
+        def held(part: slice) -> Field:
+            each, controls = rows[part].repeated(STAGES), u[part].repeat_interleave(STAGES, dim=0)
+            return lambda x, t: (controls, *self._f(each, x, controls, t)[:2])
 
-        rows : the problem at the rows' parameters, an in_torch.Rows
-        """
-        B, short = len(x), torch.as_tensor(h, dtype=x.dtype).expand(len(x), 1) / substeps
-        now, cost = torch.as_tensor(t, dtype=x.dtype).expand(B, 1), torch.zeros_like(short)
+        return self._pieces(rows, x, t, h, substeps, held)
+
+    def fed_back(self, rows: Any, x: Tensor, policy: Policy, t: Any, h: Any) -> tuple[Tensor, Tensor]:
+        """The same under a policy (x, t[, p]) -> u, as continuous feedback."""
+        def closed(part: slice) -> Field:
+            each = rows[part].repeated(STAGES)
+
+            def field(x: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+                u, u_x = _with_slope(policy, x, t, each.p)
+                f, f_x, f_u = self._f(each, x, u, t)
+                return u, f, f_x + f_u @ u_x
+            return field
+
+        return self._pieces(rows, x, t, h, 1, closed)
+
+    def _f(self, each: Any, x: Tensor, u: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        slopes = each.of_f(self.slopes, x, u, t).reshape(len(x), -1, self.nx).transpose(1, 2)
+        return each.f(x, u, t), slopes[:, :, :self.nx], slopes[:, :, self.nx:]
+
+    def _pieces(self, rows: Any, x: Tensor, t: Any, h: Any, substeps: int,
+                field: Callable[[slice], Field]) -> tuple[Tensor, Tensor]:
+        begin, length = (torch.as_tensor(one, dtype=x.dtype).expand(len(x), 1) for one in (t, h))
+        parts = [self._steps(rows[part], x[part], begin[part], length[part] / substeps, substeps, field(part))
+                 for part in (slice(k, k + ROWS) for k in range(0, len(x), ROWS))]
+        ends, costs = zip(*parts, strict=True) if parts else ([x], [x[:, :1]])
+        return torch.cat(list(ends)), torch.cat(list(costs))
+
+    def _steps(self, rows: Any, x: Tensor, t: Tensor, h: Tensor, substeps: int, field: Field) -> tuple[Tensor, Tensor]:
+        B, each, cost = len(x), rows.repeated(STAGES), torch.zeros_like(h)
         for _ in range(substeps):
-            at = [one.flatten(0, 1) for one in self._stages(rows, x, u, now, short)]
-            L = rows.repeated(STAGES).L(*at).expand(B * STAGES, 1).reshape(B, STAGES)
-            cost = cost + short * (L @ self.weight[-1])[:, None]
-            x, now = at[0].reshape(B, STAGES, self.nx)[:, -1], now + short
+            states, times = self._stages(x, t, h, field)
+            flat = states.flatten(0, 1)
+            L = each.L(flat, field(flat, times)[0], times).expand(B * STAGES, 1).reshape(B, STAGES)
+            cost = cost + h * (L @ self.weight[-1])[:, None]
+            x, t = states[:, -1], t + h
         return x, cost
 
-    def _stages(self, rows: Any, x: Tensor, u: Tensor, t: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """States, controls and times [B, s, ..] of the stages."""
+    def _stages(self, x: Tensor, t: Tensor, h: Tensor, field: Field) -> tuple[Tensor, Tensor]:
+        """States [B, s, nx] and times [B s, 1] of the stages."""
         B, s, n = len(x), STAGES, self.nx
-        each, z = rows.repeated(s), torch.zeros(B, s, n, dtype=x.dtype)
-        u, t = u[:, None].expand(B, s, u.shape[1]), t[:, None] + self.reach[:, None] * h[:, None]
-        eye = torch.eye(s * n, dtype=x.dtype)
-        left = torch.ones(B, dtype=torch.bool)
+        z, eye = torch.zeros(B, s, n, dtype=x.dtype), torch.eye(s * n, dtype=x.dtype)
+        times = (t + h * self.reach).reshape(-1, 1)
         for _ in range(ITERATIONS):
-            at = [one.flatten(0, 1) for one in (x[:, None] + z, u, t)]
-            f = each.f(*at).reshape(B, s, n)
-            f_x = each.of_f(self.slope, *at).reshape(B, s, n, n).transpose(2, 3)
-            off = z - h[:, None] * (self.weight @ f)
-            system = eye - (h[:, None, None, None] * self.weight[:, None, :, None]
-                            * f_x.permute(0, 2, 1, 3)[:, None]).reshape(B, s * n, s * n)
-            step, _ = torch.linalg.solve_ex(system, off.reshape(B, s * n, 1))
+            _, f, f_x = field((x[:, None] + z).flatten(0, 1), times)
+            off = z - h[:, None] * (self.weight @ f.reshape(B, s, n))
+            weighted = h[:, :, None, None, None] * self.weight[:, None, :, None] * \
+                f_x.reshape(B, 1, s, n, n).transpose(2, 3)
+            step, _ = torch.linalg.solve_ex(eye - weighted.reshape(B, s * n, s * n), off.reshape(B, s * n, 1))
+            moved = (step.reshape(B, s, n) / self.unit).abs().amax(dim=(1, 2))
             z = z - step.reshape(B, s, n)
-            left = ~((step.reshape(B, s, n) / self.unit).abs().amax(dim=(1, 2)) <= SETTLED)
-            if not left.any():
+            if not (moved > SETTLED).any():  # rows that are NaN are lost
                 break
-        return torch.where(left[:, None, None], torch.nan, x[:, None] + z), u, t
+        left = (off / self.unit).abs().amax(dim=(1, 2))  # at a policy's kinks steps do not settle
+        lost = ~((moved <= SETTLED) | (left <= LEFT))
+        return torch.where(lost[:, None, None], torch.nan, x[:, None] + z), times
+
+
+def _with_slope(policy: Policy, x: Tensor, t: Tensor, p: list[Tensor]) -> tuple[Tensor, Tensor]:
+    """(u [B, nu], du/dx [B, nu, nx]) of a policy whose rows do not see each other."""
+    with torch.enable_grad():
+        at = x.detach().requires_grad_()
+        u = policy(at, t, *p)
+        slopes = [torch.autograd.grad(one, at, retain_graph=True, allow_unused=True)[0] for one in u.sum(dim=0)]
+    return u.detach(), torch.stack([torch.zeros_like(x) if one is None else one for one in slopes], dim=1)

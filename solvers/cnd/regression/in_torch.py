@@ -68,6 +68,9 @@ class Rows:
         """A function that takes what f does."""
         return self.of.call("f", function, x=x, u=u, t=t, p=self._p)
 
+    def __getitem__(self, rows: slice) -> Rows:
+        return Rows(self.of, self._p[rows])
+
     def repeated(self, n: int) -> Rows:
         """Each row n times."""
         return Rows(self.of, self._p.repeat_interleave(n, dim=0))

@@ -27,6 +27,7 @@ KEPT = 2  # of them are followed to the end: those cheapest after one iteration
 NEAR = 0.1  # how near hard problems more are drawn
 SMALL = 0.1  # of a usual cost: what is added to costs before anything is divided by them
 COARSE = (2, 5, 10, 20, 40, 160, 640)  # intervals of tails that are solved for other control rates than the labels'
+AT_START = 10.0  # what a solution's start counts, of the middle of an interval: one stands for all of them
 LONGEST = 40  # a control is held for the horizon over LONGEST at most
 
 
@@ -64,18 +65,30 @@ class Labels:
     def of(solution: Solution, torch_ocp: InTorch, unit: float, substeps: int = 1) -> Labels:
         """The same as continuous controls: at the middle of its interval a held one equals them to second order.
 
-        f in torch gives the states between nodes, by half of the interval's `substeps`, or one more.
+        f in torch gives the states between nodes, by half of the interval's `substeps`, or one more. Where steps are
+        implicit, what is fast is at rest there: then the starts of solutions are labels too.
         """
         start = Labels.held(solution, unit)
         with torch.no_grad():
             half, t = torch.from_numpy(start.dt / 2)[:, None], torch.from_numpy(start.t)[:, None]
             at = (torch.from_numpy(start.x), torch.from_numpy(start.u), t, half)
             middle = torch_ocp.at(start.p).after(*at, (substeps + 1) // 2).numpy()
-        return replace(start, x=middle, t=start.t + start.dt / 2, dt=np.zeros(len(start)))
+        labels = replace(start, x=middle, t=start.t + start.dt / 2, dt=np.zeros(len(start)))
+        if torch_ocp.implicit is None:
+            return labels
+        return Labels.join([labels, _starts(start, solution.u.shape[1], torch_ocp)])
 
     @staticmethod
     def join(parts: list[Labels]) -> Labels:
         return Labels(*(np.concatenate([getattr(p, name) for p in parts]) for name in Labels.__dataclass_fields__))
+
+
+def _starts(held: Labels, K: int, torch_ocp: InTorch) -> Labels:
+    """The continuous control where each solution starts, on a line through those of its first two intervals' middles;
+    each counts as AT_START of an interval's."""
+    first, second, s = held[::K], held[1::K], torch_ocp.ocp.system
+    u = np.clip(1.5 * first.u - 0.5 * second.u, s.lbu, s.ubu)
+    return replace(first, u=u, weight=AT_START * first.weight, dt=np.zeros(len(first)))
 
 
 def at_other_rates(ddp: DDP, solution: Solution, unit: float, rng: np.random.Generator) -> Labels:
@@ -244,20 +257,21 @@ def continuous_cost(policy: Policy, torch_ocp: InTorch, at: Problems, steps: int
 
 
 def continuous_run(policy: Policy, torch_ocp: InTorch, at: Problems, steps: int) -> tuple[Array, Array, Array]:
-    """The policy as continuous feedback from there, by RK4 on (x, t, cost): J [B], x [B, steps+1, nx], t [B, steps+1].
-    Where steps are implicit, the control of each step is the policy's at its middle: off by its length squared.
+    """The policy as continuous feedback from there, by RK4 on (x, t, cost), or implicit steps: J [B],
+    x [B, steps+1, nx], t [B, steps+1].
     """
-    n, here = at.x.shape[1], torch_ocp.at(at.p)
+    n, here, steps_of = at.x.shape[1], torch_ocp.at(at.p), torch_ocp.implicit
 
     def closed_loop(z: Tensor, _: None) -> Tensor:
         x, t = z[:, :n], z[:, n:n + 1]
         u = policy(x, t, *here.p)
         return torch.cat([here.f(x, u, t), torch.ones_like(t), here.L(x, u, t)], dim=1)
 
-    def implicit(z: Tensor) -> Tensor:
+    def after(z: Tensor) -> Tensor:
+        if steps_of is None:
+            return rk4(closed_loop, z, None, h)
         x, t, J = z[:, :n], z[:, n:n + 1], z[:, n + 1:]
-        middle = here.after(x, policy(x, t, *here.p), t, h / 2)
-        end, cost = here.interval(x, policy(middle, t + h / 2, *here.p), t, h)
+        end, cost = steps_of.fed_back(here, x, policy, t, h)
         return torch.cat([end, t + h, J + cost], dim=1)
 
     z = torch.from_numpy(np.column_stack([at.x, at.t, np.zeros(len(at))]))
@@ -265,7 +279,7 @@ def continuous_run(policy: Policy, torch_ocp: InTorch, at: Problems, steps: int)
     path = [z]
     with torch.no_grad():
         for _ in range(steps):
-            path.append(implicit(path[-1]) if torch_ocp.implicit else rk4(closed_loop, path[-1], None, h))
+            path.append(after(path[-1]))
         J = (path[-1][:, n + 1] + here.G(path[-1][:, :n])[:, 0]).numpy()
     way = torch.stack(path, dim=1).numpy()
     return J, np.ascontiguousarray(way[..., :n]), np.ascontiguousarray(way[..., n])
