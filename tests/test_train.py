@@ -252,6 +252,24 @@ def test_value_scores_are_zero_for_the_exact_value():
     assert twice["hjb_mean"] > 0.1
 
 
+def test_value_scores_do_not_depend_on_units():
+    """A speed in m/s and in mm/s, and a V that is not the true one."""
+    found = []
+    for unit in (1.0, 1e3):
+        p, w, u = (ca.SX.sym(name) for name in "pwu")
+        system = nocl.System("mass", x=ca.vertcat(p, w), u=u, xdot=ca.vertcat(w / unit, unit * u), lbu=[-1], ubu=[1],
+                             lbx=[-2, -2 * unit], ubx=[2, 2 * unit])
+        ocp = nocl.OCP(system, horizon=1.0, running=u**2, terminal=p**2 + (w / unit)**2,
+                       initial_states=nocl.Gaussian([1.0, 0.0], [0.5, 0.5 * unit]))
+        best = DDP(ocp, intervals=20).solve([[1.0, 0.5 * unit], [0.5, -0.2 * unit]])
+        x, t = ca.SX.sym("x", 2), ca.SX.sym("t")
+        wrong = nocl.to_torch(ca.Function("V", [x, t], [x[0]**2 + 0.9 * x[0] * x[1] / unit + 0.2 * (x[1] / unit)**2]))
+        policy = nocl.to_torch(ca.Function("u", [x, t], [-0.3 * x[0] - 0.4 * x[1] / unit]))
+        found.append(value_scores(wrong, policy, InTorch(ocp), {"tails": best}))
+    assert found[0]["tails_degrees"] > 1
+    assert found[0] == pytest.approx(found[1], rel=1e-6)
+
+
 @pytest.mark.parametrize("stage", ["_regress", "_value"])
 def test_interrupted_and_resumed_is_the_same_run(stage, whole, tmp_path, monkeypatch):
     ocp = whole.ocp

@@ -10,6 +10,7 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from torch import Tensor
 
 from nocl.data import Solution
+from nocl.definition.scales import usual_sizes
 from nocl.hjb import hjb_residual
 from nocl.nets import FeatureNet
 from nocl.solvers.cnd.regression.in_torch import InTorch
@@ -164,15 +165,18 @@ def value_scores(value: FeatureNet, policy: Policy, torch_ocp: InTorch,
                  optima: dict[str, Solution]) -> dict[str, float]:
     """|V - J*| / |J*| (mean and median), V_x against costates (medians) of each set of optima; the HJB residual.
 
-    The residual V_t + L + V_x' f is taken at the policy's u along the last set, in units of its mean running cost.
+    Slopes are by usual states, so that units change nothing. The residual V_t + L + V_x' f is taken at the policy's u
+    along the last set, in units of its mean running cost.
     """
     row: dict[str, float] = {}
+    usual = usual_sizes(torch_ocp.ocp).x
     for name, s in optima.items():
         V, V_x = _value_and_slope(value, s.x[:, 0], s.t[:, 0], torch_ocp.at(s.parameters).p)
         error = np.abs(V - s.cost) / np.abs(s.cost)
         row |= {f"{name}_error": float(error.mean()), f"{name}_error_median": float(np.median(error))}
-        size, true = np.linalg.norm(V_x, axis=1), np.linalg.norm(s.V_x[:, 0], axis=1)
-        cosine = np.clip((V_x * s.V_x[:, 0]).sum(axis=1) / (size * true), -1, 1)
+        slope, costate = V_x * usual, s.V_x[:, 0] * usual
+        size, true = np.linalg.norm(slope, axis=1), np.linalg.norm(costate, axis=1)
+        cosine = np.clip((slope * costate).sum(axis=1) / (size * true), -1, 1)
         row[f"{name}_degrees"] = float(np.degrees(np.median(np.arccos(cosine))))
         row[f"{name}_slope_error"] = float(np.median(np.abs(size / true - 1)))
     return row | _hjb(value, policy, torch_ocp, list(optima.values())[-1])
