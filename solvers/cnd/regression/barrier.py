@@ -37,7 +37,7 @@ from nocl.translate.arguments import Arguments
 
 CORRECTION = 1 / 400  # of a run: s, or less
 BEYOND = TOLERANCE / 4  # of a scale: how far a run gets beyond a boundary within s, while half of U turns it back
-WINDOW = 10  # of corrections: w
+WINDOW = 4  # of corrections: w
 NOTHING = 1e-9  # of a scale
 PASSES = 2  # over the rows, where there are several
 TRIED = 4096  # places at which rows are looked at: of those inside, the quarter nearest to the boundary
