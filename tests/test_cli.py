@@ -291,7 +291,7 @@ def test_solve_fails_where_nothing_was_solved(here, capsys, solver):
     assert f"{solver}: 0 of 2 solved" in out
     assert err.splitlines()[-1].startswith(f"nocl: error: {solver} solved none of 2 initial states; of the first: ")
     assert ("'wall'" if solver == "ddp" else "infeasible") in err
-    assert err.count("\n") == 1
+    assert err.count("nocl: ") == 1  # beside progress, where that takes long
     assert Path(f"new/solutions/{solver}.npz").exists()
 
 
