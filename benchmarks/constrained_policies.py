@@ -52,7 +52,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     for name in PROBLEMS}
 SETTINGS["cartpole"] |= {"iterations": 2000}
 # many rival optima (first to the left or to the right, one swing or more); plans on 80 cost 1 % more
-SETTINGS["pendcart"] |= {"iterations": 2000, "intervals": 160, "branches": 2, "states": 400, "tails": 3000, "starts": 8}
+SETTINGS["pendcart"] |= {"iterations": 2000, "intervals": 160, "branches": 2, "tails": 2000, "starts": 8, "rounds": 2}
 SETTINGS["lap"] |= {"iterations": 2000, "held_out": 96}
 # rows that no map holds: margins from more held-out states
 SETTINGS["dubins"] |= {"held_out": 128, "rounds": 5}

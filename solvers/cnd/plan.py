@@ -38,6 +38,7 @@ Stage = tuple[str, int]  # its name, and the number of the round or of the fit o
 STATES, TAILS, STEPS, TIMED = 16, 64, 8, 20  # that are timed: cold starts, tails, steps of a rollout, iterations
 IMPROVING = 6  # cold starts' worth that a global search spends on neighbours
 AGAIN = 4  # solves of an answer: from the policy, and from three neighbours
+CLEANING = 12  # solves of each of the first solutions about walls, until they know of each other
 KICKED = 4  # kicked states that a controller is held against for each initial one
 VALUE_HELD_OUT = 16  # times held_out: a mean of relative errors hangs on the few states that are hard
 WORTH = 0.5  # of the work of what is left, that a further round must leave time for
@@ -60,14 +61,16 @@ class Costs:
     step: float  # of one iteration of the controller's regression
     value_step: float  # of V's
 
-    def of(self, stage: Stage, s: TrainSettings, parameters: bool, margins: bool) -> float:
-        """Seconds of a stage; margins: whether the first rounds solve all labels anew."""
+    def of(self, stage: Stage, s: TrainSettings, parameters: bool, margins: bool, walls: bool) -> float:
+        """Seconds of a stage; margins: whether the first rounds solve all labels anew; walls: whether there are
+        constraints that labels hold."""
         (name, number), several = stage, NEIGHBOURS if parameters else 1
         answer = (AGAIN + (several - 1) / 2) * self.tail
         search = (s.starts + IMPROVING) * self.cold
         if name == "labels":
             probes = 2 * PROBED * self.tail if parameters else 0.0
-            return s.seeds * search + (3 * s.states + s.tails) * (1 + several) / 2 * self.tail + probes
+            cleaned = CLEANING * (s.seeds + s.states) * self.tail if walls else 0.0
+            return s.seeds * search + (3 * s.states + s.tails) * (1 + several) / 2 * self.tail + probes + cleaned
         if name == "visits":
             former = s.seeds + s.states + s.tails + (number - 1) * s.visits if margins else 0
             hardest = s.visits * answer + s.held_out / 2 * search if parameters else 0.0
@@ -112,9 +115,9 @@ class Plan:
     """
 
     def __init__(self, settings: TrainSettings, costs: Costs | None, budget: Budget = ENDLESS, *,
-                 parameters: bool = False, margins: bool = False) -> None:
+                 parameters: bool = False, margins: bool = False, walls: bool = False) -> None:
         self.settings, self.costs, self.budget = settings, costs, budget
-        self.parameters, self.margins, self.pace = parameters, margins, 1.0
+        self.kind, self.pace = (parameters, margins, walls), 1.0
         self.held_out: int | None = None
 
     def cost(self, stage: Stage, settings: TrainSettings | None = None) -> float:
@@ -122,7 +125,7 @@ class Plan:
         if self.costs is None:
             return 1.0
         pace = self.pace if stage[0] in SCALED else 1.0
-        return pace * self.costs.of(stage, settings or self.settings, self.parameters, self.margins)
+        return pace * self.costs.of(stage, settings or self.settings, *self.kind)
 
     def ahead(self, stage: Stage) -> float:
         """Seconds from the beginning of a stage to the end of training, with as many more rounds as there is time for,

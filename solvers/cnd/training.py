@@ -38,7 +38,7 @@ from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.held import Held
 from nocl.solvers.cnd.laws import LawTraining, check_law
 from nocl.solvers.cnd.paper import PaperSettings, train_paper
-from nocl.solvers.cnd.plan import KICKED, PAYS, VALUE_HELD_OUT, Plan, measured, missed_by, stalled
+from nocl.solvers.cnd.plan import KICKED, PAYS, VALUE_HELD_OUT, Costs, Plan, measured, missed_by, stalled
 from nocl.solvers.cnd.plan import iterations as planned_iterations
 from nocl.solvers.cnd.regression import barrier
 from nocl.solvers.cnd.regression.features import at_rate, own_features, policy_net
@@ -165,7 +165,7 @@ def estimate(ocp: OCP, settings: TrainSettings, seed: int = 0) -> str:
     with one_thread(), within(False):
         run = Training(ocp, None, settings, seed, None, False)
         costs = measured(ocp, run.ddp, run.fine, run.in_torch, settings)
-    return str(Plan(settings, costs, parameters=ocp.np > 0, margins=run.margins_move))
+    return str(run.planned(costs))
 
 
 def _check(ocp: OCP, dynamics: LearnedDynamics | None, seed: int, out: str | os.PathLike[str] | None) -> None:
@@ -223,9 +223,10 @@ class Training:
         self.round, self.seconds, self.fitting, self.fitting_cpu, self.evaluations = 0, 0.0, 0.0, 0.0, 0
         self.history: list[dict[str, Any]] = []
         self.losses: list[float] = []
+        self.judged: tuple[SolutionBank, Solution] | None = None  # the last check's bank and optima of held-out states
         self.value_card: dict[str, Any] = {}
         self.opinion: dict[str, Any] = {}  # of NMPC, where it was asked for one
-        self.plan = Plan(settings, None, ENDLESS, parameters=ocp.np > 0, margins=self.margins_move)
+        self.plan = self.planned(None)
         self.best: tuple[float, int, dict[str, Any]] | None = None  # how far from the goals, the round, the weights
         self.stopped = "the goals are met"
 
@@ -238,6 +239,10 @@ class Training:
     def margins_move(self) -> bool:
         """Whether rows have margins that the rounds move."""
         return self.held is not None and bool((self.held.inward & ~self.held.guarded).any())
+
+    def planned(self, costs: Costs | None, budget: Budget = ENDLESS) -> Plan:
+        return Plan(self.settings, costs, budget, parameters=self.ocp.np > 0, margins=self.margins_move,
+                    walls=self.held is not None)
 
     @cached_property
     def steps(self) -> int:
@@ -281,7 +286,7 @@ class Training:
         costs = None
         if budget.limited or (shown(self.progress) and not self.round):
             costs = measured(self.ocp, self.ddp, self.fine, self.in_torch, s, self.own)
-        self.plan = Plan(s, costs, budget, parameters=self.ocp.np > 0, margins=self.margins_move)
+        self.plan = self.planned(costs, budget)
         if not self.round:
             say(f"{self.ocp.system.name}: training takes {self.plan}", self.progress)
 
@@ -341,9 +346,12 @@ class Training:
             self.bank = SolutionBank.of(self.ddp, self._held(seeds))
             if s.states:
                 further = Problems.initial(self.ocp, s.states, rng)
-                several = {"neighbours": NEIGHBOURS, "kept": KEPT} if self.ocp.np else {}
+                several = {"neighbours": NEIGHBOURS, "kept": KEPT} if self.ocp.np or self.held is not None else {}
                 more = extend(self.ddp, self.bank, further.x, p=further.given_p, **several)
-                self.bank = SolutionBank.of(self.ddp, self._held(type(more).join([seeds, more])))
+                known = type(more).join([seeds, more])
+                if self.held is not None:  # about walls the nearest solution often leads to a worse optimum
+                    known = self._cleaned(known[known.success], rng)
+                self.bank = SolutionBank.of(self.ddp, self._held(known))
             if self.ocp.np and rivals(self.ddp, self.bank, self._rng(5_000_000)):
                 self.bank = replace(self.bank, several=NEIGHBOURS)
             parts = [self.bank.solution] + ([tube(self.ddp, self.bank, s.tails, s.width, rng)] if s.tails else [])
@@ -362,6 +370,11 @@ class Training:
         if not found.success.any():
             return solve_globally(self.ddp, first.x, starts=starts, **search)
         return solve_globally(self.ddp, first.x, starts=0, known=found, **search)
+
+    def _cleaned(self, known: Solution, rng: np.random.Generator) -> Solution:
+        """Solutions from t = 0, solved again from each other's until nothing improves."""
+        return solve_globally(self.ddp, known.x[:, 0], p=known.p, starts=0, known=known, seed=rng,
+                              neighbours=2, rounds=3)
 
     def _second_opinion(self, seeds: Solution) -> Solution:
         """The seeds, better ones where NMPC knows some, and then all of them solved from these: where a quadratic term
@@ -467,7 +480,10 @@ class Training:
         s, rng = self.plan.within("check", self.round), self._rng(1_000_000)
         with self._solving("check", self.round, s, "held-out states", 1) as bar:
             solvers, acting = (self.ddp, self.fine, self.bank), (self.policy, self.in_torch)
-            fresh = held_out(*solvers, Problems.initial(self.ocp, s.held_out, rng))
+            at = Problems.initial(self.ocp, s.held_out, rng)
+            if self.judged is None or self.judged[0] is not self.bank or len(self.judged[1]) != len(at):
+                self.judged = self.bank, held_out(*solvers, at)  # rounds share what does not hang on the policy
+            fresh = self.judged[1]
             starts = fresh[fresh.success]
             tails = kicked_optima(*solvers, *acting, KICKED * s.held_out, s.kick, rng)
             row = {"round": self.round, "labels": len(self.labels), "loss": self.losses,
