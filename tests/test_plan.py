@@ -11,7 +11,7 @@ import torch
 
 import nocl
 from nocl.solvers.cnd import TrainSettings
-from nocl.solvers.cnd.plan import SCALED, Costs, Plan, iterations, measured, missed_by, stages, stalled
+from nocl.solvers.cnd.plan import SCALED, Costs, Kind, Plan, iterations, measured, missed_by, stages, stalled
 from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.cnd.regression.regress import LEAST, fit_net
 from nocl.solvers.cnd.validate import floored_by, labels_gap, solved_again
@@ -43,7 +43,7 @@ def trained(minutes, slow=1.0, costs=MACHINE, settings=NORMAL):
 
     def solve(name, number=0):
         s = plan.within(name, number)
-        took = slow * costs.of((name, number), s, False, False)
+        took = slow * costs.of((name, number), s, Kind())
         clock.now += took
         plan.took(name, number, s, took)
         done.append(((name, number), s))

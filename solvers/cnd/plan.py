@@ -51,6 +51,15 @@ LEAST = {"seeds": 4, "starts": 2, "states": 20, "tails": 100, "visits": 50, "hel
 
 
 @dataclass(frozen=True)
+class Kind:
+    """What makes a problem's training longer."""
+
+    parameters: bool = False
+    walls: bool = False  # constraints that labels hold
+    margins: bool = False  # of these, that the first rounds move: all labels are solved anew
+
+
+@dataclass(frozen=True)
 class Costs:
     """Seconds on this machine."""
 
@@ -61,19 +70,18 @@ class Costs:
     step: float  # of one iteration of the controller's regression
     value_step: float  # of V's
 
-    def of(self, stage: Stage, s: TrainSettings, parameters: bool, margins: bool, walls: bool) -> float:
-        """Seconds of a stage; margins: whether the first rounds solve all labels anew; walls: whether there are
-        constraints that labels hold."""
-        (name, number), several = stage, NEIGHBOURS if parameters else 1
+    def of(self, stage: Stage, s: TrainSettings, kind: Kind) -> float:
+        """Seconds of a stage."""
+        (name, number), several = stage, NEIGHBOURS if kind.parameters else 1
         answer = (AGAIN + (several - 1) / 2) * self.tail
         search = (s.starts + IMPROVING) * self.cold
         if name == "labels":
-            probes = 2 * PROBED * self.tail if parameters else 0.0
-            cleaned = CLEANING * (s.seeds + s.states) * self.tail if walls else 0.0
+            probes = 2 * PROBED * self.tail if kind.parameters else 0.0
+            cleaned = CLEANING * (s.seeds + s.states) * self.tail if kind.walls else 0.0
             return s.seeds * search + (3 * s.states + s.tails) * (1 + several) / 2 * self.tail + probes + cleaned
         if name == "visits":
-            former = s.seeds + s.states + s.tails + (number - 1) * s.visits if margins else 0
-            hardest = s.visits * answer + s.held_out / 2 * search if parameters else 0.0
+            former = s.seeds + s.states + s.tails + (number - 1) * s.visits if kind.margins else 0
+            hardest = s.visits * answer + s.held_out / 2 * search if kind.parameters else 0.0
             return s.visits * answer + former * self.tail + hardest
         if name == "check":
             near = (3 + KICKED * AGAIN) * self.tail + (1 + KICKED) * (self.fine + self.roll)
@@ -114,10 +122,9 @@ class Plan:
     costs : None where nothing could be measured: then a budget has the fewest seeds and starts, and equal shares
     """
 
-    def __init__(self, settings: TrainSettings, costs: Costs | None, budget: Budget = ENDLESS, *,
-                 parameters: bool = False, margins: bool = False, walls: bool = False) -> None:
-        self.settings, self.costs, self.budget = settings, costs, budget
-        self.kind, self.pace = (parameters, margins, walls), 1.0
+    def __init__(self, settings: TrainSettings, costs: Costs | None, budget: Budget = ENDLESS,
+                 kind: Kind = Kind()) -> None:
+        self.settings, self.costs, self.budget, self.kind, self.pace = settings, costs, budget, kind, 1.0
         self.held_out: int | None = None
 
     def cost(self, stage: Stage, settings: TrainSettings | None = None) -> float:
@@ -125,7 +132,7 @@ class Plan:
         if self.costs is None:
             return 1.0
         pace = self.pace if stage[0] in SCALED else 1.0
-        return pace * self.costs.of(stage, settings or self.settings, *self.kind)
+        return pace * self.costs.of(stage, settings or self.settings, self.kind)
 
     def ahead(self, stage: Stage) -> float:
         """Seconds from the beginning of a stage to the end of training, with as many more rounds as there is time for,

@@ -38,7 +38,7 @@ from nocl.solvers.cnd.controller import CND
 from nocl.solvers.cnd.held import Held
 from nocl.solvers.cnd.laws import LawTraining, check_law
 from nocl.solvers.cnd.paper import PaperSettings, train_paper
-from nocl.solvers.cnd.plan import KICKED, PAYS, VALUE_HELD_OUT, Costs, Plan, measured, missed_by, stalled
+from nocl.solvers.cnd.plan import KICKED, PAYS, VALUE_HELD_OUT, Costs, Kind, Plan, measured, missed_by, stalled
 from nocl.solvers.cnd.plan import iterations as planned_iterations
 from nocl.solvers.cnd.regression import barrier
 from nocl.solvers.cnd.regression.features import at_rate, own_features, policy_net
@@ -241,8 +241,7 @@ class Training:
         return self.held is not None and bool((self.held.inward & ~self.held.guarded).any())
 
     def planned(self, costs: Costs | None, budget: Budget = ENDLESS) -> Plan:
-        return Plan(self.settings, costs, budget, parameters=self.ocp.np > 0, margins=self.margins_move,
-                    walls=self.held is not None)
+        return Plan(self.settings, costs, budget, Kind(self.ocp.np > 0, self.held is not None, self.margins_move))
 
     @cached_property
     def steps(self) -> int:
