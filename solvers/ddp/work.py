@@ -145,10 +145,12 @@ class Work:
             self.iterations[rows] += 1
             self.backward(rows)
             good, bad = rows[self.positive[rows] > 0], rows[self.positive[rows] == 0]
-            self._refuse(bad)
-            self._damp(bad)
+            if bad.size:
+                self._refuse(bad)
+                self._damp(bad)
             small = -(self.slope[good] + self.curve[good]) <= self._little(good)
-            self._settle(good[small])
+            if small.any():
+                self._settle(good[small])
             self._line_search(good[~small])
 
     def _refuse(self, rows: Rows) -> None:
@@ -166,8 +168,9 @@ class Work:
         self._last_step(done)
         self._at_minimum(done)
         damped = rows[self.mu[rows] > 0]
-        self._relax(damped)
-        self._at_saddle(damped[self.mu[damped] <= self.refused[damped]])
+        if damped.size:
+            self._relax(damped)
+            self._at_saddle(damped[self.mu[damped] <= self.refused[damped]])
 
     def _at_minimum(self, rows: Rows) -> None:
         self.state[rows] = CONVERGED
@@ -195,14 +198,16 @@ class Work:
             a = self.alpha[rows]
             predicted = a * self.slope[rows] + a * a * self.curve[rows]
             done = self.new_J[rows] - self.J[rows] <= 1e-3 * np.minimum(predicted, 0.0)  # False for NaN
-            won = rows[done]
-            self._take(won)
-            self._relax(won[self.alpha[won] > 0.2])
+            if done.any():
+                won = rows[done]
+                self._take(won)
+                self._relax(won[self.alpha[won] > 0.2])
             rows = rows[~done]
             self.alpha[rows] /= 2
             stuck = self.alpha[rows] < self.ddp.settings.smallest_step
-            self._stuck(rows[stuck])
-            rows = rows[~stuck]
+            if stuck.any():
+                self._stuck(rows[stuck])
+                rows = rows[~stuck]
 
     def _stuck(self, rows: Rows) -> None:
         """No step along what the sweep says lowers J."""
