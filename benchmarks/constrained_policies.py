@@ -9,7 +9,7 @@ hidden  the share of these runs that violate a constraint by more than 1e-3 of i
 kicked  the same from states along these runs after a kick of 0.02 of each state's spread, at KICKS times. Those from
         which DDP finds no plan that holds the constraints are counted apart; so are initial states
 
-A controller is kept in --runs and judged again from there. Results go to benchmarks/results/constrained_policies.json,
+A controller is kept in --runs and judged again from there; a training that was stopped goes on from its last round. Results go to benchmarks/results/constrained_policies.json,
 problem by problem.
 """
 
@@ -52,7 +52,8 @@ SETTINGS: dict[str, dict[str, Any]] = {
     for name in PROBLEMS}
 SETTINGS["cartpole"] |= {"iterations": 2000}
 # many rival optima (first to the left or to the right, one swing or more); plans on 80 cost 1 % more
-SETTINGS["pendcart"] |= {"iterations": 2000, "intervals": 160, "branches": 2, "tails": 2000, "starts": 8, "rounds": 2}
+SETTINGS["pendcart"] |= {"iterations": 8000, "hidden": (128, 128, 128), "intervals": 160, "branches": 2, "tails": 2000,
+                         "starts": 8, "rounds": 2, "held_out": 32}
 SETTINGS["lap"] |= {"iterations": 2000, "held_out": 96}
 # rows that no map holds: margins from more held-out states
 SETTINGS["dubins"] |= {"held_out": 128, "rounds": 5}
@@ -66,7 +67,7 @@ def controller(name: str, ocp: OCP, seed: int, runs: Path) -> CND:
     if (folder / "cnd.safetensors").exists():
         return CND.load(folder)
     settings = TrainSettings.of("normal", **{"value": False, **SETTINGS[name]})
-    cnd = nocl.train(ocp, settings=settings, seed=seed, progress=True)
+    cnd = nocl.train(ocp, settings=settings, seed=seed, out=folder, progress=True)
     cnd.save(folder)
     return cnd
 
