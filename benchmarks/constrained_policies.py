@@ -9,8 +9,8 @@ hidden  the share of these runs that violate a constraint by more than 1e-3 of i
 kicked  the same from states along these runs after a kick of 0.02 of each state's spread, at KICKS times. Those from
         which DDP finds no plan that holds the constraints are counted apart; so are initial states
 
-A controller is kept in --runs and judged again from there; a training that was stopped goes on from its last round. Results go to benchmarks/results/constrained_policies.json,
-problem by problem.
+A controller is kept in --runs and judged again from there; a training that was stopped goes on from its last round.
+Results go to benchmarks/results/constrained_policies.json, problem by problem.
 """
 
 from __future__ import annotations
