@@ -264,6 +264,22 @@ def test_seeds_hold_what_can_be_held_and_the_others_pay_for_little():
     assert hard.success.tolist() == [True, True, False]
 
 
+def test_first_labels_pass_on_the_better_side():
+    """Of a disc in the way, though the one seed passes on one side: the other is as much dearer as the state lies off."""
+    p, u = ca.SX.sym("p", 2), ca.SX.sym("u", 2)
+    s = nocl.System("past", x=p, u=u, xdot=u, lbu=[-3, -3], ubu=[3, 3], lbx=[-2, -2], ubx=[2, 2])
+    ocp = OCP(s, horizon=2.0, running=ca.sumsqr(u), terminal=20 * ((p[0] - 1.5)**2 + p[1]**2), x_goal=[1.5, 0],
+              u_goal=[0, 0], initial_states=nocl.Uniform([-1.5, -0.4], [-1.5, 0.4]),
+              constraints={"disc": ca.sumsqr(p) - 0.49})
+    training = Training(ocp, None, replace(TINY, seeds=1, states=24, tails=0), 0, None, False)
+    training._first_labels()
+    found = training.bank.solution
+    mirrored = training.ddp.solve(found.x[:, 0], u=found.u * [1, -1])
+    assert len(found) == 25
+    assert (np.sign(found.x[:, 10, 1]) == np.sign(found.x[:, 0, 1])).mean() > 0.9
+    assert (found.cost <= 1.001 * mirrored.cost).all()
+
+
 def test_lost_states_are_no_labels():
     ocp = double_integrator()
     held = Held(ocp)
