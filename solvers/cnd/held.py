@@ -107,6 +107,7 @@ class Held:
             return margin
         most = np.max([_all_but(share, over) for over, share in runs], axis=0)
         more = np.where(self.guarded & (most <= TOLERANCE), 0.0, most - TOLERANCE / 2)
+        more[more < 0] /= 2  # what one fit did not need the next one may
         return np.where(self.inward, np.clip(margin + more, 0.0, LARGEST), 0.0)
 
     def summary(self, exceeded: Array, name: str) -> dict[str, Any]:

@@ -305,11 +305,13 @@ class Training:
         return False
 
     def _end_rounds(self) -> None:
-        """Takes the best round's controller where time or gain ended them, and says what is missing and why."""
+        """Takes the best round's controller where time or gain ended them, or the last ones violate more than others,
+        and says what is missing and why."""
         s, row, floor = self.settings, self.history[-1], ""
         if not self._meets(row):
             floor = self._floor(row)
-            if self.best is not None and self.best[1] != row["round"] and self.round <= s.rounds:
+            used_up = self.round > s.rounds and self.held is None  # then the last one was fitted for the longest
+            if self.best is not None and self.best[1] != row["round"] and not used_up:
                 self.net.load_state_dict(self.best[2])
                 row = self.history[self.best[1]]
             say(f"{self.ocp.system.name}: {self.stopped}; gap {100 * row['gap_median']:.3g} %, 95th percentile "
