@@ -265,7 +265,7 @@ def test_seeds_hold_what_can_be_held_and_the_others_pay_for_little():
 
 
 def test_first_labels_pass_on_the_better_side():
-    """Of a disc in the way, though the one seed passes on one side: the other is as much dearer as the state lies off."""
+    """Of a disc in the way, though the one seed passes on one side: the farther off a state lies, the dearer it is."""
     p, u = ca.SX.sym("p", 2), ca.SX.sym("u", 2)
     s = nocl.System("past", x=p, u=u, xdot=u, lbu=[-3, -3], ubu=[3, 3], lbx=[-2, -2], ubx=[2, 2])
     ocp = OCP(s, horizon=2.0, running=ca.sumsqr(u), terminal=20 * ((p[0] - 1.5)**2 + p[1]**2), x_goal=[1.5, 0],
