@@ -221,3 +221,18 @@ def test_a_log_whose_samples_are_far_apart_is_fitted_by_shorter_steps():
     assert errors[0] < 0.5 * errors[1]
     at = torch.tensor([[0.0, 0.3]], dtype=torch.float64), torch.tensor([[0.0]], dtype=torch.float64)
     assert model(*at)[0, 1].item() == pytest.approx(-9.0, rel=0.1)
+
+
+def test_a_limit_that_is_touched_does_not_make_a_grid_coarse():
+    """The penalty that soft constraints have is no cost of plans that hold them: its kink is no error of theirs."""
+    x, v, u = (ca.SX.sym(name) for name in "xvu")
+    system = nocl.System("cart", x=ca.vertcat(x, v), u=u, xdot=ca.vertcat(v, u), lbu=[-4], ubu=[4], lbx=[-2, -2],
+                         ubx=[2, 2])
+    ocp = nocl.OCP(system, horizon=3.0, running=1e-3 * u**2, terminal=1e-2 * (x**2 + v**2), x_goal=[0, 0], u_goal=[0],
+                   initial_states=nocl.Gaussian(mean=[1.5, 0], std=[0.1, 0.05]), state_bounds={"v": (-0.6, 0.6)})
+    for solver in (DDP(ocp, substeps=1, threads=1), NMPC(ocp, substeps=1)):
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            solution = solver.solve(ocp.initial_states.sample(3, 0))
+        assert np.abs(solution.x[:, :, 1]).max() == pytest.approx(0.6, abs=1e-5)
+        assert measured(ocp, ocp.functions, solution, 1).error < 1e-12  # RK4 is exact for it
