@@ -128,7 +128,7 @@ def judged(name: str, n: int, seed: int, runs: Path) -> dict[str, Any]:
     row = {"gap": gaps(run.cost[holds], best.cost[holds]), "hidden": violations(ocp, run, holds),
            "kicked": kicked(ocp, cnd, run, bank, rng), "seed": seed, "settings": changed,
            "training seconds": cnd.card["seconds"], "fitting cpu seconds": cnd.card["fitting_cpu_seconds"],
-           "rounds": len(cnd.card["history"]) - 1, "margins": cnd.card["history"][-1]["margin"],
+           "rounds": len(cnd.card["history"]) - 1, "margins": cnd.card["history"][cnd.card["round"]]["margin"],
            "judging seconds": round(time.perf_counter() - begin)}
     kept = run.violation[holds] <= ALLOWED
     if kept.any():

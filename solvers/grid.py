@@ -29,22 +29,27 @@ SMALL = 1e-3  # of the usual cost: below it, errors count as shares of that
 Stages = dict[str, Array]  # x [n, nx], u [n, nu], t [n], p [n, np]
 
 
-def measured(ocp: OCP, functions: Functions, solution: Solution, substeps: int, integrator: str = RK4) -> Grid | None:
-    """The grid of some solutions of an OCP under f, by the first ROWS that were solved; None where none was."""
+def measured(ocp: OCP, functions: Functions, solution: Solution, substeps: int, integrator: str = RK4,
+             soft: bool = False) -> Grid | None:
+    """The grid of some solutions of an OCP under f, by the first ROWS that were solved; None where none was.
+
+    soft : whether their costs have the penalty of soft constraints; its kinks are no error of plans that hold them
+    """
     solution = solution[np.flatnonzero(solution.success)[:ROWS]]
     if not len(solution):
         return None
-    step, errors = float(np.diff(solution.t, axis=1).max()), _errors(ocp, functions, solution, integrator)
+    step, errors = float(np.diff(solution.t, axis=1).max()), _errors(ocp, functions, solution, integrator, soft)
     return grid_of(step, substeps, lambda n: float(errors(n).max()), fastest(functions, _stages(solution)),
                    tried=TRIED if integrator == RK4 else FEW, explicit=integrator == RK4)
 
 
-def followed(ocp: OCP, functions: Functions, solution: Solution, substeps: int, integrator: str = RK4) -> Solution:
+def followed(ocp: OCP, functions: Functions, solution: Solution, substeps: int, integrator: str = RK4,
+             soft: bool = False) -> Solution:
     """The same, where a grid is too coarse: rows whose plan is off by more than APART have failed, and say so."""
     solved = np.flatnonzero(solution.success)
     if not len(solved):
         return solution
-    error = _errors(ocp, functions, solution[solved], integrator)(substeps)
+    error = _errors(ocp, functions, solution[solved], integrator, soft)(substeps)
     lost, error = solved[error > APART], error[error > APART]
     said = [f"not solved: with substeps={substeps} plan and plant differ by {100 * e:.3g} %: a singularity on the way, "
             f"or {REMEDY}" for e in error]
@@ -66,7 +71,7 @@ def firsts(ocp: OCP) -> tuple[Array, Array]:
     return ocp.initial_states.sample(ROWS, own_numbers(0)), ocp.sample_parameters(ROWS, own_numbers(0, 2))
 
 
-def _errors(ocp: OCP, functions: Functions, s: Solution, integrator: str) -> Callable[[int], Array]:
+def _errors(ocp: OCP, functions: Functions, s: Solution, integrator: str, soft: bool) -> Callable[[int], Array]:
     """substeps -> the error of each row."""
     B, K, nx = len(s), s.u.shape[1], s.x.shape[2]
     x, h = s.x[:, :-1].reshape(-1, nx).T, np.diff(s.t, axis=1).reshape(1, -1)
@@ -75,8 +80,7 @@ def _errors(ocp: OCP, functions: Functions, s: Solution, integrator: str) -> Cal
     cost, slope = np.maximum(np.abs(s.cost), SMALL * usual.cost), s.V_x[:, 1:].reshape(-1, nx).T
     known: dict[int, Array] = {}
     finest = (RK4, FINEST) if h.max() <= STABLE * FINEST * fastest(functions, moment) else (RADAU, FINEST_IMPLICIT)
-    # without the penalty of soft constraints, whose kinks are no error of plans that hold them
-    steps = {kind: functions.step(soft=False, integrator=kind) for kind in {integrator, finest[0]}}
+    steps = {kind: functions.step(soft=soft, integrator=kind) for kind in {integrator, finest[0]}}
 
     def after(kind: str, n: int) -> tuple[Array, Array]:
         z, total = x, np.zeros((1, B * K))

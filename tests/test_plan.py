@@ -233,7 +233,7 @@ def test_a_training_that_no_longer_gains_ends_and_says_what_floors_it(monkeypatc
         cnd = nocl.train(ocp, settings=replace(TINY, rounds=9, value=False), progress=True)
     assert cnd.card["stopped"] == "the last two rounds did not pay"
     assert [r["round"] for r in cnd.card["history"]] == [0, 1, 2]
-    assert cnd.card["history"][-1]["floor"]["by"] in (said := capsys.readouterr().err)
+    assert cnd.card["history"][cnd.card["round"]]["floor"]["by"] in (said := capsys.readouterr().err)
     assert "double_integrator: training takes about" in said
 
 

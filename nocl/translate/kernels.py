@@ -5,7 +5,7 @@ from __future__ import annotations
 import ctypes
 import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from nocl.support import compiler
 from nocl.support.compiler import CompilerError
 from nocl.translate.instructions import instructions
 
-KINDS = "dfl"  # characters of the types that a kernel takes: float64, float32, int64
+KINDS = frozenset(np.dtype(kind) for kind in (np.float64, np.float32, np.int64))  # that a kernel takes
 HEADERS = Path(__file__).parent / "csrc"
 FLAGS = ("-std=gnu11", "-O2", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-flax-vector-conversions",
          "-Wno-psabi", "-fPIC", "-shared")
@@ -93,7 +93,7 @@ class Kernel:
         share = -(-blocks // max(threads, 1))
         pieces = [(s, min(s + share, blocks)) for s in range(0, blocks, share)]
 
-        def run(piece: tuple[int, int]) -> None:
+        def run(piece: tuple[int, int], held: tuple[object, ...] = args) -> None:  # arrays live as long as work on them
             function = self._library[name]  # a fresh handle: argument types are the handle's
             function(ctypes.c_int64(piece[0]), ctypes.c_int64(piece[1]), _c(index), *pointers)
 
@@ -101,8 +101,10 @@ class Kernel:
             for piece in pieces:
                 run(piece)
         else:
-            working = [_threads(len(pieces)).submit(run, piece) for piece in pieces]  # ctypes releases the lock
+            working = list[Future[None]]()
             try:
+                for piece in pieces:
+                    working.append(_threads(threads).submit(run, piece))  # ctypes releases the interpreter's lock
                 for one in working:
                     one.result()
             except BaseException:  # Ctrl-C: the arrays are theirs until they are done
@@ -123,7 +125,7 @@ def _c(value: object) -> Any:
     if value is None:
         return ctypes.c_void_p(None)
     if isinstance(value, np.ndarray):
-        if not value.flags.c_contiguous or value.dtype.char not in KINDS:
+        if not value.flags.c_contiguous or value.dtype not in KINDS:
             raise ValueError(f"a kernel got an array of {value.dtype}, contiguous: {value.flags.c_contiguous}")
         return ctypes.c_void_p(value.__array_interface__["data"][0])  # value.ctypes takes three times as long
     return ctypes.c_int64(int(value))  # type: ignore[call-overload]

@@ -77,7 +77,7 @@ class Costs:
         search = (s.starts + IMPROVING) * self.cold
         if name == "labels":
             probes = 2 * PROBED * self.tail if kind.parameters else 0.0
-            cleaned = CLEANING * (s.seeds + s.states) * self.tail if kind.walls else 0.0
+            cleaned = CLEANING * (s.seeds + s.states) * self.tail if kind.walls and s.states else 0.0
             return s.seeds * search + (3 * s.states + s.tails) * (1 + several) / 2 * self.tail + probes + cleaned
         if name == "visits":
             former = s.seeds + s.states + s.tails + (number - 1) * s.visits if kind.margins else 0
@@ -235,7 +235,10 @@ def missed_by(row: dict[str, Any], s: TrainSettings) -> float:
     """How far a round is from its goals: the worst as a multiple of its goal, violations first."""
     gap = max(_ratio(row[name], goal) for name, goal in goals(s).items() if name != "gap_violating")
     violating = row.get("gap_violating", 0.0)
-    return gap if violating <= s.violating else 1e6 * (1 + violating) + min(gap, 1e6)
+    if not math.isfinite(violating):
+        return math.inf
+    few = violating <= max(s.violating, 1 / s.held_out)  # one run is none: the gap says more
+    return gap if few else 1e6 * (1 + violating) + min(gap, 1e6)
 
 
 def _ratio(value: float, goal: float) -> float:

@@ -309,11 +309,11 @@ class Training:
         and says what is missing and why."""
         s, row, floor = self.settings, self.history[-1], ""
         if not self._meets(row):
-            floor = self._floor(row)
             used_up = self.round > s.rounds and self.held is None  # then the last one was fitted for the longest
             if self.best is not None and self.best[1] != row["round"] and not used_up:
                 self.net.load_state_dict(self.best[2])
                 row = self.history[self.best[1]]
+            floor = self._floor(row)
             say(f"{self.ocp.system.name}: {self.stopped}; gap {100 * row['gap_median']:.3g} %, 95th percentile "
                 f"{100 * row['gap_p95']:.3g} %, wanted {100 * s.gap_median:g} and {100 * s.gap_p95:g} %: {floor}",
                 self.progress)
@@ -373,9 +373,13 @@ class Training:
         return solve_globally(self.ddp, first.x, starts=0, known=found, **search)
 
     def _cleaned(self, known: Solution, rng: np.random.Generator) -> Solution:
-        """Solutions from t = 0, solved again from each other's until nothing improves."""
-        return solve_globally(self.ddp, known.x[:, 0], p=known.p, starts=0, known=known, seed=rng,
-                              neighbours=2, rounds=3)
+        """Solutions from t = 0, solved again from each other's until nothing improves, for three rounds at most; what
+        got cheaper by leaving constraints stays as it was."""
+        found = solve_globally(self.ddp, known.x[:, 0], p=known.p, starts=0, known=known, seed=rng,
+                               neighbours=2, rounds=3)
+        lost = self._held(known).success & ~self._held(found).success
+        found.put(lost, known[lost])
+        return found
 
     def _second_opinion(self, seeds: Solution) -> Solution:
         """The seeds, better ones where NMPC knows some, and then all of them solved from these: where a quadratic term
@@ -649,7 +653,8 @@ class Training:
                 "margin": None if self.margin is None else self.margin.tolist(),
                 "opinion": self.opinion, "round": self.round, "history": self.history, "seconds": self.seconds,
                 "fitting": self.fitting, "fitting_cpu": self.fitting_cpu,
-                "first": self.first, "several": self.bank.several, "evaluations": self._evaluations(),
+                "first": self.first, "several": self.bank.several, "scale": self.bank.scale.tolist(),
+                "evaluations": self._evaluations(),
                 "best": None if self.best is None else self.best[:2]}
         self.checkpoint.parent.mkdir(parents=True, exist_ok=True)
         store.save_checkpoint(self.checkpoint, state, meta)
@@ -663,7 +668,8 @@ class Training:
             return False
         arrays = _arrays(state["labels"])
         self.labels = Labels(**{"p": np.zeros((len(arrays["t"]), 0)), **arrays})  # no empty arrays are in files
-        self.bank = replace(SolutionBank.from_arrays(self.ddp, _arrays(state["bank"])), several=meta.get("several", 1))
+        bank = SolutionBank.from_arrays(self.ddp, _arrays(state["bank"]))
+        self.bank = replace(bank, several=meta.get("several", 1), scale=np.array(meta.get("scale", bank.scale)))
         if meta["margin"] is not None:
             self._inside(np.array(meta["margin"]))
         self.solved = [_converged(_arrays(state[f"solved-{i}"])) for i in range(meta["solved"])]

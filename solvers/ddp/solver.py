@@ -200,12 +200,13 @@ class DDP:
         functions = _functions(self.ocp, self.dynamics)
         if not self.checked and solution.success.any():
             self.checked = True
-            grid = measured(self.ocp, functions, solution, self.substeps, self.integrator)
+            grid = measured(self.ocp, functions, solution, self.substeps, self.integrator, self.constraints == "soft")
             self.coarse = grid is not None and grid.coarse
             if self.coarse:
                 warnings.warn(f"DDP of {self.ocp.system.name}: {grid}", stacklevel=3)
         lost = self.coarse and self.left
-        return followed(self.ocp, functions, solution, self.substeps, self.integrator) if lost else solution
+        soft = self.constraints == "soft"
+        return followed(self.ocp, functions, solution, self.substeps, self.integrator, soft) if lost else solution
 
     def descend(self, batch: Piece) -> Solution:
         """Solve one piece of a batch, here."""

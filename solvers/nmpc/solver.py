@@ -279,7 +279,7 @@ class NMPC:
             if not hope and not finer._search(call.few()).success.any():
                 return None
             s = found[steps] = finer._search(call.within(steps))
-            grids[steps] = measured(self.ocp, functions, s, *reversed(steps))
+            grids[steps] = measured(self.ocp, functions, s, *reversed(steps), self.constraints == "soft")
             return grids[steps]
 
         steps = settled(f"NMPC of {self.ocp.system.name}", ask, step, lambda: fastest_at_start(self.ocp, functions),
@@ -290,14 +290,15 @@ class NMPC:
         return self._followed(found[steps], steps) if grid is not None and grid.coarse else found[steps]
 
     def _followed(self, solution: Solution, steps: Steps) -> Solution:
-        return followed(self.ocp, self._first._program.functions, solution, *reversed(steps))
+        functions, soft = self._first._program.functions, self.constraints == "soft"
+        return followed(self.ocp, functions, solution, *reversed(steps), soft)
 
     def _told(self, solution: Solution) -> Solution:
         """The same; a warning, once for each program, where the first solutions show a grid that is too coarse."""
         p = self.program
         if "told" not in p.settled and solution.success.any():
             p.settled["told"] = True
-            grid = measured(self.ocp, p.functions, solution, p.substeps, p.integrator)
+            grid = measured(self.ocp, p.functions, solution, p.substeps, p.integrator, self.constraints == "soft")
             if grid is not None and grid.coarse:
                 warnings.warn(f"NMPC of {self.ocp.system.name}: {grid}", stacklevel=3)
         return solution

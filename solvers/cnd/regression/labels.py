@@ -21,7 +21,7 @@ from nocl.support.checks import Array
 from nocl.translate.rk4 import rk4
 
 Policy = Callable[..., Tensor]  # (x, t[, p]) -> u
-NEIGHBOURS = 10  # starts of a tail where the nearest one's optimum may be of another kind: with parameters, or walls
+NEIGHBOURS = 10  # starts where the nearest one's optimum may be of another kind: with parameters, or about walls
 PROBED, RARE, SAME = 300, 0.003, 1e-4  # states by which it is found out whether there are such; costs so close are one
 KEPT = 2  # of them are followed to the end: those cheapest after one iteration
 NEAR = 0.1  # how near hard problems more are drawn
