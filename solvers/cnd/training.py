@@ -486,7 +486,7 @@ class Training:
         with self._solving("check", self.round, s, "held-out states", 1) as bar:
             solvers, acting = (self.ddp, self.fine, self.bank), (self.policy, self.in_torch)
             at = Problems.initial(self.ocp, s.held_out, rng)
-            if self.judged is None or self.judged[0] is not self.bank or len(self.judged[1]) != len(at):
+            if self.judged is None or self.judged[0] is not self.bank:
                 self.judged = self.bank, held_out(*solvers, at)  # rounds share what does not hang on the policy
             fresh = self.judged[1]
             starts = fresh[fresh.success]

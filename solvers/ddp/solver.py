@@ -197,15 +197,14 @@ class DDP:
 
     def _held_against_plant(self, solution: Solution) -> Solution:
         """Warns, once, where the first solutions show a grid that is too coarse; rows far off fail if it was nocl's."""
-        functions = _functions(self.ocp, self.dynamics)
+        functions, soft = _functions(self.ocp, self.dynamics), self.constraints == "soft"
         if not self.checked and solution.success.any():
             self.checked = True
-            grid = measured(self.ocp, functions, solution, self.substeps, self.integrator, self.constraints == "soft")
+            grid = measured(self.ocp, functions, solution, self.substeps, self.integrator, soft)
             self.coarse = grid is not None and grid.coarse
             if self.coarse:
                 warnings.warn(f"DDP of {self.ocp.system.name}: {grid}", stacklevel=3)
         lost = self.coarse and self.left
-        soft = self.constraints == "soft"
         return followed(self.ocp, functions, solution, self.substeps, self.integrator, soft) if lost else solution
 
     def descend(self, batch: Piece) -> Solution:
