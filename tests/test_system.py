@@ -277,7 +277,8 @@ def test_table_look_ups_are_refused_at_once(kind):
 
 @pytest.mark.parametrize(("word", "way"), [
     ("delay", "a few more states, each a first-order lag"), ("integrality", "one problem for each mode"),
-    ("alg", "solve the equations for z within it"), ("sample_time", "hold=K"), ("outputs", "put an observer before it"),
+    ("mass_matrix", "an equation for a z of its own"), ("sample_time", "hold=K"),
+    ("outputs", "put an observer before it"),
     ("noise", "robust=True"), ("du_max", "nocl.limit_rates"), ("x_max", 'state_bounds={"v": (-2, 2)}'),
     ("angle", "units: did you mean angles?"), ("colour", "expected name, x, u, xdot, lbu")])
 def test_what_there_is_not_is_answered(word, way):

@@ -45,6 +45,7 @@ SAMPLES = 64  # initial states, and parameters, that a problem is tried at on co
 ROUNDING = 1e-6  # of a scale: no violation
 REST = 1e-9  # of the width of X, and of a usual L: what stands still, and costs nothing
 FEW = 5  # parameters, beside the usual ones, that constraints are tried at
+HOLD_Z = ("running", "terminal", "constraints", "path_constraints", "terminal_constraints")
 N_IMAGES, SAME_IMAGE = 16, 1e-9  # points of the box; relative to usual values, images that agree so far are one
 
 
@@ -125,6 +126,8 @@ class OCP:
                 self._set(**{name: checks.number(getattr(self, name), name, owner, positive=name == "horizon")})
         self._set(p=known.column(self.p, owner))
         check_unique((*s.names, *self.parameter_names), False, owner)
+        if s.z.numel():
+            self._set(**{name: s.without_z(getattr(self, name)) for name in HOLD_Z})
         t, p = known.time(), self._all_p
         self._check_constraints(owner)
         self._set(terminal=self._end(owner))

@@ -13,7 +13,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nocl.definition import parameters, pretty
+from nocl.definition import algebraic, parameters, pretty
 from nocl.support import checks
 from nocl.support.asked import answered
 from nocl.support.checks import MALFORMED, Array, Vector
@@ -23,6 +23,7 @@ from nocl.translate.arguments import Arguments
 Generator = np.random.Generator
 N_SAME, SAME = 16, 1e-9  # points, and relative to usual values: equations that agree so far are the same
 N_PROBES = 512  # points of the box at which the equations are tried on construction
+_NONE = checks.FrozenSX(ca.SX(0, 1))
 
 
 @answered
@@ -41,6 +42,12 @@ class System:
         logs teach them (nocl.identify with `data`).
     p : casadi.SX, optional
         A column of parameters, nocl.parameter(name, nominal, unit): constant along a trajectory (a mass, a length).
+    z, alg : casadi.SX, optional
+        Algebraic variables [nz], symbols that xdot may hold, and as many equations 0 = alg(x, z, u, t, p) of index 1.
+        They are solved for z (nocl/definition/algebraic.py), once: xdot then holds no z, `alg` is z less its solution,
+        `algebraic` gives z, and costs and constraints of an OCP may hold z too.
+    z_guess : [nz], numbers or expressions of x, u and p
+        Near which solution z is looked for; default 0.
     lbu, ubu : [nu]
         Hard control bounds U, finite.
     lbx, ubx : [nx]
@@ -64,6 +71,9 @@ class System:
     lbx: Vector = field(kw_only=True)
     ubx: Vector = field(kw_only=True)
     p: Any = field(default=None, kw_only=True)
+    z: Any = field(default=None, kw_only=True)
+    alg: Any = field(default=None, kw_only=True)
+    z_guess: Any = field(default=None, kw_only=True)
     angles: Sequence[str] = field(default=(), kw_only=True)
     units: Mapping[str, str] = field(default_factory=dict, kw_only=True)
 
@@ -76,14 +86,13 @@ class System:
             self._set(**{name: checks.FrozenSX(ca.vertcat(*parts))})
         self._set(p=parameters.column(self.p, owner))
         check_unique((*self.names, *self.parameter_names), False, owner)
-        if self.xdot is not None:
-            z, t = ca.vertcat(self.x, self.u, self.p), parameters.time()
-            self._set(xdot=checks.expression(checks.column(self.xdot), self.nx, z, "xdot", owner, time=t))
-            instructions.check_scalar(ca.Function("xdot", [z, t], [self.xdot]), f"{owner}: xdot")
-        check_unique((*self.names, *self.parameter_names), self.uses_time, owner)
         lbu, ubu = checks.bounds(self.lbu, self.ubu, self.nu, ("lbu", "ubu"), owner, self.control_names)
         lbx, ubx = checks.bounds(self.lbx, self.ubx, self.nx, ("lbx", "ubx"), owner, self.state_names)
         self._set(lbu=lbu, ubu=ubu, lbx=lbx, ubx=ubx)
+        self._set_algebraic(owner)
+        if self.xdot is not None:
+            self._set(xdot=self._expression(self.xdot, self.nx, "xdot", owner))
+        check_unique((*self.names, *self.parameter_names, *self.algebraic_names), self.uses_time, owner)
         self._check_names(owner)
         if self.xdot is not None:
             self._check_finite(owner)
@@ -92,13 +101,53 @@ class System:
         for key, value in values.items():
             object.__setattr__(self, key, value)
 
+    def _expression(self, value: Any, rows: int, name: str, owner: str, z: ca.SX = _NONE) -> ca.SX:
+        """A column in x, u, t, p and z, without z; ValueError for any other."""
+        own, t = ca.vertcat(self.x, self.u, self.p), parameters.time()
+        e = checks.expression(checks.column(value), rows, ca.vertcat(own, self.z, z), name, owner, time=t)
+        instructions.check_scalar(ca.Function(name, [ca.vertcat(own, self.z, z), t], [e]), f"{owner}: {name}")
+        return checks.FrozenSX(self.without_z(e))
+
+    def _set_algebraic(self, owner: str) -> None:
+        """z, solved for, as symbols and `alg`, z less its solution; empty where there is none."""
+        if self.z is None or (isinstance(self.z, ca.SX) and self.z.is_empty()):
+            if self.alg is not None and not (isinstance(self.alg, ca.SX) and self.alg.is_empty()):
+                raise ValueError(f"{owner}: alg is given and z is not; expected the symbols that it is solved for, z=")
+            return self._set(z=_NONE, alg=_NONE, z_guess=None)
+        z = checks.FrozenSX(ca.vertcat(*checks.symbols(checks.column(self.z), "z", owner)))
+        check_unique((*self.names, *self.parameter_names, *(s.name() for s in ca.vertsplit(z))), False, owner)
+        self._set(z=_NONE)
+        if self.alg is None:
+            raise ValueError(f"{owner}: z is given and alg is not; expected {counted(z.numel(), 'equation')} 0 = alg, "
+                             "expressions of x, z, u and p")
+        g = self._expression(self.alg, z.numel(), "alg", owner, z)
+        given = [0.0] * z.numel() if self.z_guess is None else self.z_guess
+        guess = self._expression(list(given) if isinstance(given, np.ndarray) else given, z.numel(), "z_guess", owner)
+        known = algebraic.Box({"x": self.x, "u": self.u, "t": parameters.time(), "p": self.p},
+                              np.r_[self.lbx, self.lbu], np.r_[self.ubx, self.ubu], self.nominal)
+        solution = algebraic.solved(z, g, guess, known, owner)
+        return self._set(z=z, alg=checks.FrozenSX(z - solution), z_guess=None)
+
+    def without_z(self, e: Any) -> Any:
+        """An expression, or a mapping or a tuple that holds some, with the solution in place of algebraic variables."""
+        if isinstance(e, Mapping):
+            return {name: self.without_z(one) for name, one in e.items()}
+        if isinstance(e, (tuple, list)):
+            return type(e)(map(self.without_z, e))
+        held = isinstance(e, ca.SX) and self.z.numel() and ca.depends_on(e, self.z)
+        return ca.substitute(e, self.z, self._solution) if held else e
+
+    @property
+    def _solution(self) -> ca.SX:
+        return -ca.substitute(self.alg, self.z, ca.DM.zeros(self.z.numel()))
+
     def _check_names(self, owner: str) -> None:
         angles = (self.angles,) if isinstance(self.angles, str) else self.angles
         if not isinstance(angles, (list, tuple)) or any(a not in self.state_names for a in angles):
             raise ValueError(f"{owner}: angles is {self.angles!r}; expected a list of names of states "
                              f"({', '.join(self.state_names)})")
         angles = tuple(a for a in self.state_names if a in angles)
-        named = (*self.names, *self.parameter_names)
+        named = (*self.names, *self.parameter_names, *self.algebraic_names)
         if not isinstance(self.units, Mapping) or any(n not in named for n in self.units):
             raise ValueError(f"{owner}: units is {self.units!r}; expected a dict from names of states and controls "
                              f"({', '.join(named)}) to units")
@@ -158,6 +207,11 @@ class System:
         return parameters.names_of(self.p)
 
     @property
+    def algebraic_names(self) -> tuple[str, ...]:
+        """Those of the algebraic variables."""
+        return parameters.names_of(self.z)
+
+    @property
     def input_names(self) -> tuple[str, ...]:
         """Those of the controls, then of the parameters: what logs and labels of f have beside states."""
         return self.control_names + self.parameter_names
@@ -170,7 +224,8 @@ class System:
     @cached_property
     def uses_time(self) -> bool:
         """Whether xdot holds the time."""
-        return self.xdot is not None and bool(ca.depends_on(self.xdot, parameters.time()))
+        known = self.alg if self.xdot is None else ca.vertcat(self.xdot, self.alg)
+        return bool(ca.depends_on(known, parameters.time()))
 
     def refuse_parameters(self, owner: str) -> None:
         """ValueError where f holds parameters or the time: for what has no use of them, or not yet."""
@@ -202,6 +257,13 @@ class System:
         return self.arguments.function("f", {"xdot": self.equations})
 
     @cached_property
+    def algebraic(self) -> ca.Function:
+        """(x [nx], u [nu][, t][, p [np]]) -> the algebraic variables z [nz], of a system that has some."""
+        if not self.z.numel():
+            raise ValueError(f"system {self.name!r} has no algebraic variables; expected System(..., z=, alg=)")
+        return self.arguments.function("algebraic", {"z": self._solution})
+
+    @cached_property
     def jacobian(self) -> ca.Function:
         """(x, u[, t][, p]) -> (A [nx, nx] = df/dx, B [nx, nu] = df/du), dense."""
         A, B = (ca.densify(ca.jacobian(self.equations, v)) for v in (self.x, self.u))
@@ -222,8 +284,8 @@ class System:
         """The system with its parameters folded in as constants: p as [np], or by name."""
         value = parameters.rows(p, self.parameter_names, 1, f"{self.name}.at")[0]
         units = {n: unit for n, unit in self.units.items() if n not in self.parameter_names}
-        xdot = None if self.xdot is None else ca.substitute(self.xdot, self.p, ca.DM(value))
-        return replace(self, xdot=xdot, p=None, units=units)
+        xdot, alg = (None if e is None else ca.substitute(e, self.p, ca.DM(value)) for e in (self.xdot, self.alg))
+        return replace(self, xdot=xdot, alg=alg, p=None, units=units)
 
     def with_inputs(self, low: Array, high: Array) -> System:
         """f(x, u, p) as f(x, (u, p)): the parameters after the controls, between low and high [np]."""
@@ -296,6 +358,8 @@ class System:
                 "f": None if self.xdot is None else instructions.to_data(self.f),
                 "angles": list(self.angles), "units": dict(self.units),
                 **({"p": parameters.to_data(self.p)} if self.np else {}),
+                **({"z": list(self.algebraic_names), "z_is": instructions.to_data(self.algebraic)}
+                   if self.z.numel() else {}),
                 **{name: getattr(self, name).tolist() for name in ("lbu", "ubu", "lbx", "ubx")}}
 
     @staticmethod
@@ -307,8 +371,10 @@ class System:
             p = parameters.from_data(data.get("p", ()))
             at = {"x": x, "u": u, parameters.TIME: parameters.time(), "p": p}
             xdot = None if data["f"] is None else read(data["f"], at)
-            return System(data["name"], x=x, u=u, xdot=xdot, p=p, angles=data["angles"], units=data["units"],
-                          **{name: data[name] for name in ("lbu", "ubu", "lbx", "ubx")})
+            z = ca.vertcat(*map(ca.SX.sym, data["z"])) if "z" in data else None
+            alg = None if z is None else z - read(data["z_is"], at)
+            return System(data["name"], x=x, u=u, xdot=xdot, p=p, z=z, alg=alg, angles=data["angles"],
+                          units=data["units"], **{name: data[name] for name in ("lbu", "ubu", "lbx", "ubx")})
         except MALFORMED as error:
             raise ValueError(f"not a System written by nocl: {type(error).__name__}: {error}; expected what to_data "
                              "gave") from error

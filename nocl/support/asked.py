@@ -13,8 +13,8 @@ _DELAY = ("f(x, u) has no delays: make a delayed control or measurement a few mo
           "after the other; how a law bears a delay that it does not know: nocl.comparisons.study(..., robust=True)")
 _INTEGER = ("controls are continuous in [lbu, ubu]: solve one problem for each mode and take the best, or let a "
             "callable round what the law answers, and have it judged by nocl.simulate")
-_ALGEBRAIC = ("xdot = f(x, u, t, p) is explicit: solve the equations for z within it, or give z a fast state of its "
-              "own, z' = (what z should be - z) / tau")
+_ALGEBRAIC = ("algebraic equations are semi-explicit, System(..., z=z, alg=...), 0 = alg(x, z, u, t, p) of index 1: "
+              "make what multiplies xdot an equation for a z of its own, M z = f with xdot = z")
 _DISCRETE = ("xdot is a rate in continuous time; the solvers hold controls on `intervals`, a law is sampled by "
              "nocl.simulate(..., hold=K): give the equations whose step this is")
 _OUTPUT = ("a law sees all states: put an observer before it, u = law(estimate, t), and have that callable judged by "
@@ -27,7 +27,7 @@ _STATES = ('bounds of trajectories are state_bounds={"v": (-2, 2)} of the OCP; l
 ASKED: Mapping[str, tuple[str, str]] = {word: answer for words, answer in (
     (("delay", "delays", "dead_time", "lag"), ("delays", _DELAY)),
     (("integer", "integers", "integrality", "discrete_controls", "binary"), ("integer controls", _INTEGER)),
-    (("z", "alg", "algebraic", "constraints_alg", "M", "mass_matrix"), ("algebraic equations", _ALGEBRAIC)),
+    (("algebraic", "constraints_alg", "M", "mass_matrix"), ("implicit equations", _ALGEBRAIC)),
     (("dt", "ts", "Ts", "sample_time", "discrete", "x_next"), ("discrete time", _DISCRETE)),
     (("y", "output", "outputs", "measurement", "measurements", "h"), ("measured outputs", _OUTPUT)),
     (("noise", "disturbance", "w", "stochastic"), ("noise", _NOISE)),
