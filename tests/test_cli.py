@@ -76,6 +76,8 @@ BAD = [
     ("run cubic.py --seed 1.5", "at least 0"),
     ("run cubic.py --intervals 0", "at least 1"),
     ("run cubic.py --intervals 1", "intervals"),
+    ("run cubic.py --integrator radau", "add --exact"),
+    ("train cubic.py --integrator radau", "add --exact"),
     ("run cubic.py --methods CND,MAGIC", "cnd, nmpc, lqr, ddp"),
     ("run cubic.py --methods CND,CND", "cnd, nmpc, lqr, ddp"),
     ("run cubic.py --methods=", "cnd, nmpc, lqr, ddp"),
@@ -311,6 +313,14 @@ def small(monkeypatch):
 
 
 RUN = ["run", "cubic.py", "--out", "out", "--quick", "--n", "2", "--intervals", "10"]
+
+
+@pytest.mark.slow
+def test_training_takes_the_steps_that_are_asked_for(here, monkeypatch):
+    small(monkeypatch)
+    train = ["train", "cubic.py", "--exact", "--out", "out", "--quick", "--intervals", "10"]
+    assert main([*train, "--integrator", "radau"]) == 0
+    assert CND.load(here / "out" / "cnd").card["integrator"] == "radau"
 
 
 @pytest.mark.slow

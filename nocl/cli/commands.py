@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from nocl import __version__
 from nocl.cli import arguments, reproduce
+from nocl.definition.substeps import INTEGRATORS, RADAU
 from nocl.solvers import registry
 from nocl.support.fields import EFFORTS
 from nocl.support.lock import alone
@@ -99,7 +100,8 @@ def parser() -> argparse.ArgumentParser:
     sub = command("doctor", _doctor, "examine a problem in half a minute: goal, controllability, stiffness, optima")
     _add(sub, "problem", "p", "seed", "intervals")
     sub = command("run", _run, "identify, train, export, solve by NMPC, compare and report, in one go")
-    _add(sub, "problem", "p", "out", "seed", "n", "exact", "effort", "quick", "minutes", "intervals", "methods")
+    _add(sub, "problem", "p", "out", "seed", "n", "exact", "effort", "quick", "minutes", "intervals", "integrator",
+         "methods")
     sub = command("identify", _identify, "learn the dynamics, from the equations or from logged trajectories")
     _add(sub, "problem", "p", "out", "seed", "effort", "quick", "minutes")
     sub.add_argument("--data", type=Path, metavar="LOG", help="a .csv or .parquet file with columns t, states, "
@@ -109,7 +111,7 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--control-affine", action="store_true", help="with --data: xdot = a(x) + B(x) u")
     sub.add_argument("--hold-controls", action="store_true", help="with --data: an empty control is the last before it")
     sub = command("train", _train, "train a controller and a value function, on learned dynamics unless --exact")
-    _add(sub, "problem", "p", "out", "seed", "exact", "effort", "quick", "minutes", "intervals")
+    _add(sub, "problem", "p", "out", "seed", "exact", "effort", "quick", "minutes", "intervals", "integrator")
     sub = command("solve", _solve, "solve the problem from many initial states")
     _add(sub, "problem", "p", "out", "seed", "n", "intervals")
     sub.add_argument("--solver", choices=registry.solvers(), default="nmpc", metavar="NAME",
@@ -117,8 +119,7 @@ def parser() -> argparse.ArgumentParser:
     sub.add_argument("--substeps", type=arguments.count, metavar="S", help="steps in each interval of a plan; "
                      "default: 1, or as many as the first solutions ask for, held against the plant on far shorter "
                      "steps")
-    sub.add_argument("--integrator", choices=("rk4", "radau"), help="of these steps: Runge and Kutta's, or implicit "
-                     "ones; default: the former, or without --substeps the latter where they would be too many")
+    _add(sub, "integrator")
     sub.add_argument("--workers", type=arguments.workers, default="auto", metavar="W",
                      help="processes or threads of the solver, auto, or a Dask scheduler's tcp://...; default: auto")
     sub = command("export", _export, "write a run's controller, value function and dynamics, proven equal to it")
@@ -165,6 +166,9 @@ def _add(sub: argparse.ArgumentParser, *names: str) -> None:
                                           "to fit it, and the best controller so far is taken; default: no limit"}),
         "intervals": ("--intervals", {"type": arguments.count, "default": 80, "metavar": "N",
                                       "help": "of plans, of training's too; default: 80"}),
+        "integrator": ("--integrator", {"choices": INTEGRATORS, "help": "of the steps in each interval: Runge and "
+                                        "Kutta's, or implicit ones; default: the former, or the latter where they "
+                                        "would be too many"}),
         "methods": ("--methods", {"type": arguments.methods, "default": ("cnd", "nmpc"), "metavar": "A,B",
                                   "help": f"default: cnd,nmpc; {_told_of(registry.METHODS)}"})}
     for name in names:
@@ -215,8 +219,11 @@ def _doctor(args: argparse.Namespace) -> None:
         raise ValueError(f"doctor: {sum(one.verdict == 'PROBLEM' for one in found.findings)} problem(s), named above")
 
 
-def _check_learnable(ocp: OCP) -> None:
-    """ValueError where dynamics are to be learned of a system that holds the time."""
+def _check_learnable(ocp: OCP, integrator: str | None = None) -> None:
+    """ValueError where dynamics are to be learned of a system that holds the time, or trained on by implicit steps."""
+    if integrator == RADAU:
+        raise ValueError("--integrator radau makes steps of the exact f, and training is to be on learned dynamics; "
+                         "expected both: add --exact, or leave it out")
     if ocp.system.uses_time:
         raise ValueError("learned dynamics are not implemented for the time t, which the system "
                          f"{ocp.system.name!r} holds; expected one without: train on the equations, --exact")
@@ -228,8 +235,8 @@ def _run(args: argparse.Namespace) -> None:
     ocp, out = _problem(args)
     if not args.exact:
         ocp.refuse_free("nocl run without --exact")
-        _check_learnable(ocp)
-    stages = RunFolder(ocp, out, args.seed, args.effort, args.minutes, args.intervals)
+        _check_learnable(ocp, args.integrator)
+    stages = RunFolder(ocp, out, args.seed, args.effort, args.minutes, args.intervals, args.integrator)
     stages.check(exact=args.exact)
     _refuse(ocp, args.methods, registry.Options(args.intervals, args.seed))
     with alone(out):
@@ -274,8 +281,8 @@ def _train(args: argparse.Namespace) -> None:
     ocp, out = _problem(args)
     if not args.exact:
         ocp.refuse_free("nocl train without --exact")
-        _check_learnable(ocp)
-    stages = RunFolder(ocp, out, args.seed, args.effort, args.minutes, args.intervals)
+        _check_learnable(ocp, args.integrator)
+    stages = RunFolder(ocp, out, args.seed, args.effort, args.minutes, args.intervals, args.integrator)
     stages.check(exact=args.exact)
     with alone(out):
         stages.train(exact=args.exact)

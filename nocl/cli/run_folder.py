@@ -34,7 +34,7 @@ from nocl.exports.bundle import export
 from nocl.judge.simulation import simulate
 from nocl.solvers import registry
 from nocl.solvers.cnd.controller import CND
-from nocl.solvers.cnd.settings import TrainSettings
+from nocl.solvers.cnd.settings import AUTO, TrainSettings
 from nocl.solvers.cnd.training import train
 from nocl.support import store
 from nocl.support.budget import ENDLESS, Budget
@@ -62,6 +62,7 @@ class RunFolder:
     effort: str = "normal"  # the word that scales all settings: "quick", "normal" or "best"
     minutes: float | None = None  # of identification and training together, from when this is made on
     intervals: int = INTERVALS  # of training's plans
+    integrator: str | None = None  # of their steps; None: what fits
     begin: float = field(default_factory=time.monotonic)
 
     def check(self, exact: bool) -> None:
@@ -122,7 +123,8 @@ class RunFolder:
         """The controller and value function, in cnd/; on dynamics/ unless exact."""
         model = None if exact else self._good_enough(self.identify(IDENTIFYING))
         data = {} if model is None else {k: v for k, v in model.card[KEY].items() if k in OF_LOGS}
-        grid = {} if self.intervals == INTERVALS else {"intervals": self.intervals}
+        grid: dict[str, Any] = {"intervals": self.intervals} if self.intervals != INTERVALS else {}
+        grid |= {} if self.integrator is None else {"integrator": self.integrator}
         made_from, there = self._made_from(exact=exact, **grid, **data), self._cnd_there()
         if there is not None and there.card.get(KEY) == made_from:
             say(f"controller: taken from {self.folder / 'cnd'}")
@@ -130,7 +132,8 @@ class RunFolder:
         say(f"controller: training on {'the exact' if exact else 'learned'} dynamics" + _anew(there))
         start = time.perf_counter()
         checkpoint = self.folder / "checkpoint" / "cnd"
-        settings = TrainSettings.of(self.effort, parameters=self.ocp.np, intervals=self.intervals)
+        settings = TrainSettings.of(self.effort, parameters=self.ocp.np, intervals=self.intervals,
+                                    integrator=self.integrator or AUTO)
         left = None if self.minutes is None else self._minutes_left()
         cnd = train(self.ocp, model, seed=self.seed, settings=settings, out=checkpoint, minutes=left)
         cnd.card[KEY] = made_from
@@ -178,7 +181,8 @@ class RunFolder:
                 hold: Sequence[int | None] | None = None, robust: bool = False) -> None:
         """Study the methods on n fresh initial states, save the report and print its summary and verdict."""
         at = cnd.card.get("p")  # those that it was folded at
-        entries, options = [registry.METHODS[name] for name in methods], registry.Options(intervals, self.seed)
+        entries = [registry.METHODS[name] for name in methods]
+        options = registry.Options(intervals, self.seed, integrator=self.integrator)
         titles = ", ".join(entry.title for entry in entries)
         say(f"comparing {titles} on {n} initial states, drawn with seed {fresh_seed(self.seed)}{own_p(self.ocp, at)}, "
             "on the exact dynamics")
