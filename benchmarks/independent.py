@@ -100,7 +100,7 @@ class Equations:
     def __init__(self, ocp: nocl.OCP, p: Array) -> None:
         s, self.ocp, self.p = ocp.system, ocp, p
         self.symbols = [s.x, s.u, nocl.time(), ca.vertcat(s.p, ocp.p)]
-        self.rate = ca.Function("rate", self.symbols, [ca.vertcat(s.xdot, ocp.running)])
+        self.rate = ca.Function("rate", self.symbols, [ca.vertcat(s.equations, ocp.running)])
         self.low, self.high = s.lbu, s.ubu
         self.size = np.maximum(np.abs(s.lbx), np.abs(s.ubx))
         of, least = ocp.functions, self._least_scale
@@ -133,7 +133,7 @@ class Equations:
     def slopes(self) -> ca.Function:
         """(x, u, t, p) -> df/dx, df/du."""
         x, u, *_ = self.symbols
-        f = self.ocp.system.xdot
+        f = self.ocp.system.equations
         return ca.Function("slopes", self.symbols, [ca.jacobian(f, x), ca.jacobian(f, u)])
 
     @cached_property

@@ -179,13 +179,41 @@ def test_where_it_is_not_found_it_is_nan():
 X, U, Z, W = sx("x", "u", "z", "w")
 
 
+def toy(**changes):
+    return nocl.System("toy", **{"x": X, "u": U, "z": Z, "alg": Z - X - U, "xdot": -X + Z, "lbx": [-1], "ubx": [1],
+                                 "lbu": [-1], "ubu": [1], **changes})
+
+
+@pytest.mark.parametrize("decades", [0, 5, 8])
+@pytest.mark.parametrize("n", [1, 4, 8])
+@pytest.mark.parametrize("bent", [0.0, 0.2])
+def test_units_of_z_and_of_equations_do_not_count(n, decades, bent):
+    """Equations whose solution is known, A y = x + i u, or A (y + bent y^3), with z and rows of any size."""
+    rng = np.random.default_rng(n)
+    A, z = np.eye(n) * 2 + 0.3 * rng.normal(size=(n, n)), sx(*(f"z{i}" for i in range(n)))
+    of_z, of_g = (10.0 ** rng.uniform(-decades, decades, n) for _ in range(2))
+    y = ca.vertcat(*z) / ca.DM(of_z)
+    right = ca.DM(np.linspace(0.5, 1, n)) * X + ca.DM(np.linspace(-1, 1, n)) * U
+    s = toy(z=z, alg=ca.DM(of_g) * (ca.DM(A) @ (y + bent * y**3) - right), xdot=-X + y[0])
+    at = points(s)
+    found = s.algebraic(*at).full() / of_z[:, None]
+    wanted = np.linspace(0.5, 1, n)[:, None] * at[0] + np.linspace(-1, 1, n)[:, None] * at[1]
+    np.testing.assert_allclose(A @ (found + bent * found**3), wanted, rtol=1e-9, atol=1e-9)
+
+
 @pytest.mark.parametrize(("changes", "message"), [
     ({"alg": X - U}, "do not determine z"),
     ({"z": [Z, W], "alg": [Z + W - X, Z + W - U]}, "singular in z"),
     ({"alg": Z**2 + 1 + X**2}, "no z solve"),
     ({"alg": Z**2 - X, "z_guess": [1.0]}, "no z solve"),
+    ({"alg": ca.log(Z) - X - U}, "no z solve"),  # where the guess is 0
+    ({"alg": 1 / Z - X, "z_guess": [5.0]}, "no z solve"),
+    ({"alg": Z / X - U}, "no z solve"),
+    ({"alg": ca.log(Z) - 8 * X, "z_guess": [1.0]}, "make its logarithm"),
+    ({"alg": Z + ca.tanh(1e4 * Z) - X - U}, "not found by|no z solve"),
     ({"alg": None}, "alg is not"),
     ({"z": None}, "z is not"),
+    ({"z": None, "alg": None, "z_guess": [1.0]}, "z_guess is given and z is not"),
     ({"alg": [Z, Z]}, "alg has shape"),
     ({"alg": Z - W}, "contains the symbol"),
     ({"z": X}, "more than once"),
@@ -194,16 +222,47 @@ X, U, Z, W = sx("x", "u", "z", "w")
 ])
 def test_what_cannot_be_solved_is_refused(changes, message):
     with pytest.raises(ValueError, match=message):
-        nocl.System("toy", **{"x": X, "u": U, "z": Z, "alg": Z - X - U, "xdot": -X + Z, "lbx": [-1], "ubx": [1],
-                              "lbu": [-1], "ubu": [1], **changes})
+        toy(**changes)
+
+
+def test_a_guess_that_is_the_solution_is_taken():
+    """Two branches that come near each other: z = (-x / 2 +- sqrt(x^2 / 4 + 0.004)) / 2."""
+    half = X / 2
+    s = toy(alg=Z * Z + X * Z / 2 - 1e-3, z_guess=(-half + ca.sqrt(half**2 + 4e-3)) / 2)
+    x = np.linspace(-1, 1, 401)[None]
+    np.testing.assert_allclose(s.algebraic(x, 0), (-x / 2 + np.sqrt(x**2 / 4 + 4e-3)) / 2, rtol=1e-9)
+
+
+def test_empty_lists_are_nothing():
+    assert toy(z=[], alg=[], xdot=-X).z.is_empty()
+
+
+def test_units_and_equations_are_shown():
+    s = toy(units={"z": "V"})
+    assert s.unit("z") == "z [V]"
+    assert "dx/dt = z - x" in repr(s)
+    assert "0 = z - x - u" in repr(s)
 
 
 def test_nothing_is_solved_for_parameters_without_a_value():
     mass = nocl.parameter("mass")
-    options = {"x": X, "u": U, "z": Z, "p": mass, "xdot": -X + Z, "lbx": [-1], "ubx": [1], "lbu": [-1], "ubu": [1]}
-    assert float(nocl.System("toy", **options, alg=mass * Z - X - U).algebraic(1, 2, 4)) == 0.75
+    assert float(toy(p=mass, alg=mass * Z - X - U).algebraic(1, 2, 4)) == 0.75
     with pytest.raises(ValueError, match="nominal="):
-        nocl.System("toy", **options, alg=mass * Z + Z**3 - X - U)
+        toy(p=mass, alg=mass * Z + Z**3 - X - U)
+
+
+def test_a_problem_solves_for_z_all_over_its_times_and_parameters():
+    gain = nocl.parameter("gain", nominal=1.0)
+    s = toy(p=gain, alg=Z + Z**3 - X - gain * U - nocl.time(), z_guess=[0.0])
+    ocp = nocl.OCP(s, horizon=30.0, running=U**2 + 1e-3 * s.z**2, terminal=0.0,
+                   initial_states=nocl.Uniform([-0.5], [0.5]), parameters=nocl.Uniform([0.2], [30.0]))
+    for t, p in ((0.0, 0.2), (30.0, 30.0), (12.0, 3.0)):
+        z = float(ocp.system.algebraic(0.4, 0.9, t, p))
+        assert abs(z + z**3 - 0.4 - p * 0.9 - t) < 1e-11
+    z = float(ocp.at([30.0]).system.algebraic(0.4, 0.9, 12.0))
+    assert abs(z + z**3 - 0.4 - 27 - 12) < 1e-11
+    z = float(s.with_inputs([0.2], [30.0]).algebraic(0.4, [0.9, 30.0], 0.0))
+    assert abs(z + z**3 - 0.4 - 27) < 1e-11
 
 
 def test_an_end_that_hangs_on_the_control_is_refused():

@@ -6,13 +6,16 @@ polynomial that is fitted to solutions in the box: as many as that takes, and tw
 derivatives are those of the implicit function theorem too. Where they do not converge, beyond the box, say, z is NaN,
 never a number that does not solve the equations.
 
-Solutions in the box are found from each other, beginning in its middle, and must belong to one branch: det(dg/dz) is
-nowhere 0 (the DAE has index 1) and nowhere of another sign.
+Solutions in the box are continued from each other, beginning in its middle, by steps in which Newton's method contracts
+at once, so that they belong to one branch: det(dg/dz) is nowhere 0 (the DAE has index 1) and nowhere of another sign.
+A pole that is far narrower than the box is not seen: pH, not the concentration of ions, is a variable for Newton's method.
+All is done in units of z and of the equations in which the entries of dg/dz are about 1.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from itertools import combinations_with_replacement
 
 import casadi as ca
@@ -21,52 +24,37 @@ import numpy as np
 from nocl.support.checks import Array
 
 PROBES = 512  # points of the box that a start is fitted to, and as many that it is tried at
-SPREAD = 0.8, 1.2  # of the nominal parameters, in the box
 FIRST = 8  # of them, the nearest to the middle of the box, are solved first; then twice as many, and so on
-ITERATIONS, HALVINGS = 60, 30  # of Newton's method at points of the box, and of each of its steps
+BALANCED = 8  # rounds in which rows and columns of dg/dz get units
+ITERATIONS, HALVINGS = 60, 30  # of Newton's method at the first point, and of each of its steps
 CONVERGED = 1e-12  # a step, as a share of usual z: what is left is its square
+PIECES, SHORTEST = 300, 2.0**-10  # of the way from a point to the next, tried, and the shortest
+CONTRACTS = 0.25  # of a step the next one is no longer, on the branch
+STEPS = 8  # of a piece
 NEAR = 1e-6  # a step from which on two more are exact
+ROUNDING = 1e-10  # a step that need not get shorter
+WIDE = 1e-5  # of the largest z: where a twentieth of them are smaller, no step is small for all
 HIGHEST, TERMS = 8, 64  # degree of a fitted polynomial, and terms
 BEYOND = 1.25  # shares of the box at which it ends
-DEARER = 2  # steps more than the fewest are worth a lower degree
+SOON = 4  # steps, of which no higher degree makes fewer that count
 MOST = 10  # steps that are written out
 LOST = 1e-6  # a last step, as a share of usual z, from which on z is NaN
-REGULAR = 1e-13  # condition of dg/dz, its rows and columns scaled: less is singular
+SOLVED = 1e-8  # ... of linear equations, as they are found
+REGULAR = 1e-13  # condition of dg/dz in its units: less is singular
 UNSEEN = 1e-200  # what a guard is multiplied by: finite, it changes nothing; NaN, it is NaN
 
 
-def solved(z: ca.SX, g: ca.SX, guess: ca.SX, inputs: Box, owner: str) -> ca.SX:
-    """z [nz] as expressions of the inputs; ValueError where g(z) = 0 has no solution in the box, or not one."""
-    J = ca.jacobian(g, z)
-    if ca.sprank(J) < z.numel():
-        raise ValueError(f"{owner}: the equations alg do not determine {_names(z)}, whatever the values: dalg/dz has "
-                         f"rank {ca.sprank(J)} (index 2 or more); expected as many independent equations in z as "
-                         "there are z: differentiate a constraint that holds no z, and use the result in its place")
-    equations = Equations(z, g, J, inputs, owner)
-    unknown = [s.name() for s in inputs.unknown if ca.depends_on(g, s)]
-    if not equations.linear:
-        if unknown:
-            raise ValueError(f"{owner}: alg holds {', '.join(unknown)}, of which no value is known; expected one, "
-                             "nocl.parameter(name, nominal=...): z is solved for near it")
-        return _by_newton(equations, guess)
-    found = ca.densify(ca.solve(J, -ca.substitute(g, z, ca.DM.zeros(z.numel()))))
-    if not unknown:
-        equations.check_index(inputs.probes(0), equations.values_of(found, inputs.probes(0)))
-    return found
-
-
 class Box:
-    """What z is a function of, and points where it is looked for: the box of x and u, times and values of p.
+    """What z is a function of, and points where it is looked for.
 
-    symbols : columns by name; low, high [n] of x and u; nominal [np]
+    symbols : columns by name; low, high : of all their entries [n]; NaN where nothing is known
     """
 
-    def __init__(self, symbols: dict[str, ca.SX], low: Array, high: Array, nominal: Array) -> None:
-        self.symbols, self.column = symbols, ca.vertcat(*symbols.values())
-        about = [np.nan_to_num(nominal) * share for share in SPREAD]
-        self.low, self.high = np.r_[low, 0.0, np.minimum(*about)], np.r_[high, 0.0, np.maximum(*about)]
-        self.unknown = [s for s, value in zip(ca.vertsplit(symbols["p"]), nominal, strict=True) if np.isnan(value)]
-        self.names = [s.name() for s in ca.vertsplit(self.column)]
+    def __init__(self, symbols: Mapping[str, ca.SX], low: Array, high: Array) -> None:
+        self.column = ca.vertcat(*symbols.values())
+        self.parts = ca.vertsplit(self.column)
+        self.unknown = [s for s, value in zip(self.parts, low, strict=True) if np.isnan(value)]
+        self.low, self.high = np.nan_to_num(low), np.nan_to_num(high)
 
     def probes(self, seed: int) -> Array:
         """[PROBES, n], the middle first."""
@@ -81,126 +69,215 @@ class Box:
 
     def said(self, v: Array) -> str:
         """A point in words, without what is the same everywhere."""
-        return ", ".join(f"{name} = {value:.4g}" for name, value, width in
-                         zip(self.names, v, self.high - self.low, strict=True) if width > 0)
+        return ", ".join(f"{s.name()} = {value:.4g}" for s, value, width in
+                         zip(self.parts, v, self.high - self.low, strict=True) if width > 0)
+
+
+def solved(z: ca.SX, g: ca.SX, guess: ca.SX, box: Box, owner: str) -> ca.SX:
+    """z [nz] as expressions of the inputs; ValueError where g(z) = 0 has no solution in the box, or not one."""
+    J = ca.jacobian(g, z)
+    if ca.sprank(J) < z.numel():
+        raise ValueError(f"{owner}: the equations alg do not determine {_names(z)}, whatever the values: dalg/dz has "
+                         f"rank {ca.sprank(J)} (index 2 or more); expected as many independent equations in z as "
+                         "there are z: differentiate a constraint that holds no z, and use the result in its place")
+    unknown = [s.name() for s in box.unknown if ca.depends_on(g, s)]
+    with np.errstate(all="ignore"):  # what is not finite is no solution
+        if not ca.depends_on(J, z):
+            return _linear(z, g, box, owner, checked=not unknown)
+        if unknown:
+            raise ValueError(f"{owner}: alg holds {', '.join(unknown)}, of which no value is known; expected one, "
+                             "nocl.parameter(name, nominal=...): z is solved for near it")
+        return _by_newton(z, g, guess, box, owner)
+
+
+def changes(g: ca.SX, z: ca.SX, inputs: ca.SX) -> bool:
+    """Whether the solution of equations that are not linear in z hangs on some inputs: where they lie counts."""
+    return bool(inputs.numel() and ca.depends_on(g, inputs) and ca.depends_on(ca.jacobian(g, z), z))
 
 
 class Equations:
-    """g(z) = 0 and dg/dz at many points v at once."""
+    """g(z) = 0 at many points v at once, z and g in units of their own: z = c y, d g(c y) = 0 for y."""
 
-    def __init__(self, z: ca.SX, g: ca.SX, J: ca.SX, inputs: Box, owner: str) -> None:
-        self.z, self.inputs, self.owner, self.n = z, inputs, owner, z.numel()
-        self.linear = not ca.depends_on(J, z)
-        self.moving = [i for i, s in enumerate(ca.vertsplit(inputs.column))
-                       if inputs.high[i] > inputs.low[i] and ca.depends_on(g, s)]
-        self.both = ca.Function("alg", [z, inputs.column], [ca.densify(g), ca.densify(J)])
+    def __init__(self, z: ca.SX, g: ca.SX, box: Box, owner: str) -> None:
+        self.z, self.g, self.box, self.owner, self.n = z, g, box, owner, z.numel()
+        self.moving = [i for i, s in enumerate(box.parts) if box.high[i] > box.low[i] and ca.depends_on(g, s)]
+        self._in_units(np.ones(self.n), np.ones(self.n))
 
-    def at(self, z: Array, v: Array) -> tuple[Array, Array]:
-        """g [B, n] and dg/dz [B, n, n]."""
-        g, J = self.both(z.T, v.T)
+    def _in_units(self, rows: Array, columns: Array) -> None:
+        self.rows, self.unit, y = rows, columns, ca.SX.sym("y", self.n)
+        g = ca.DM(rows) * ca.substitute(self.g, self.z, ca.DM(columns) * y)
+        self.both = ca.Function("alg", [y, self.box.column], [ca.densify(g), ca.jacobian(g, y)])
+
+    def balance(self, y: Array, v: Array) -> Array:
+        """Take units in which dg/dz at y [B, n] is about 1; y in these."""
+        J = np.abs(self.at(y, v)[1])
+        usual = np.nan_to_num(np.where(np.isfinite(J), J, 0.0).max(axis=0))
+        rows, columns = _units(usual)
+        self._in_units(self.rows * rows, self.unit * columns)
+        return y / columns
+
+    def at(self, y: Array, v: Array) -> tuple[Array, Array]:
+        """d g [B, n] and its Jacobian by y [B, n, n]."""
+        g, J = self.both(y.T, v.T)
         return g.full().T, J.full().reshape(self.n, len(v), self.n).transpose(1, 0, 2)
 
     def values_of(self, e: ca.SX, v: Array) -> Array:
-        """An expression of the inputs at points [B, n]."""
-        return ca.Function("e", [self.inputs.column], [e])(v.T).full().T
+        """An expression of the inputs at points [B, n], as z is: in units of y."""
+        return ca.Function("e", [self.box.column], [e])(v.T).full().T / self.unit
 
-    def step(self, z: Array, v: Array) -> Array:
-        """Newton's [B, n]; NaN where dg/dz is singular."""
-        g, J = self.at(z, v)
+    def step(self, y: Array, v: Array) -> Array:
+        """Newton's [B, n]; NaN where the Jacobian is singular."""
+        g, J = self.at(y, v)
         return _times(_inverses(J), g)
 
-    def solve(self, z: Array, v: Array) -> Array:
-        """z [B, n] by damped steps; NaN where they lead nowhere."""
-        z = z.copy()
+    def solve(self, y: Array, v: Array) -> Array:
+        """y [1, n] by damped steps; NaN where they lead nowhere."""
         for _ in range(ITERATIONS):
-            g, J = self.at(z, v)
+            g, J = self.at(y, v)
             inverse = _inverses(J)
             step = _times(inverse, g)
-            moves = (np.abs(step) / _sizes(z)).max(axis=1) > CONVERGED
-            if not moves.any():
+            size, before = _sizes(y), _large(step, _sizes(y))
+            if not before > CONVERGED:
                 break
-            z[moves] = self._shortened(z[moves], step[moves], inverse[moves], v[moves])
-        z[~((np.abs(self.step(z, v)) / _sizes(z)).max(axis=1) < NEAR)] = np.nan
-        return z
+            for _ in range(HALVINGS):
+                tried = y - step
+                left = _large(_times(inverse, self.at(tried, v)[0]), size)
+                if left < before or max(left, before) < ROUNDING:
+                    break
+                step = step / 2
+            else:
+                return np.full_like(y, np.nan)
+            y = tried
+        return y if _large(self.step(y, v), _sizes(y)) < NEAR else np.full_like(y, np.nan)
 
-    def _shortened(self, z: Array, step: Array, inverse: Array, v: Array) -> Array:
-        """z less as much of a step as brings g down, in the measure of dg/dz at z; NaN where no part of it does."""
-        share, found, todo = np.ones(len(z)), np.full_like(z, np.nan), np.arange(len(z))
-        before = np.abs(step).max(axis=1)
-        rounding = CONVERGED * _sizes(z).min()
-        for _ in range(HALVINGS):
-            tried = z[todo] - share[todo, None] * step[todo]
-            left = np.abs(_times(inverse[todo], self.at(tried, v[todo])[0])).max(axis=1)
-            good = left <= (1 - share[todo] / 4) * before[todo] + rounding
-            found[todo[good]], todo = tried[good], todo[~good]
-            share[todo] /= 2
-            if not len(todo):
+    def contracted(self, y: Array, v: Array, usual: Array) -> Array:
+        """y [B, n] by steps each of which is far shorter than the one before; NaN where they are not."""
+        before = np.full(len(y), np.inf)
+        for _ in range(STEPS):
+            step = self.step(y, v)
+            beyond = np.abs(step) - CONVERGED * usual
+            now = (beyond.clip(min=0) / np.maximum(np.abs(y), WIDE * usual)).max(axis=1)
+            y = np.where(((now <= CONTRACTS * before) | (now <= ROUNDING))[:, None], y - step, np.nan)
+            before = now
+            if not (now > ROUNDING).any():
                 break
-        return found
+        y[~(before <= NEAR)] = np.nan
+        return y
 
-    def _said(self, z: Array) -> str:
-        return ", ".join(f"{s.name()} = {value:.4g}" for s, value in zip(ca.vertsplit(self.z), z, strict=True))
+    def follow(self, y: Array, begin: Array, end: Array, guess: ca.Function) -> Array:
+        """Solutions y [B, n] at points `begin` [B, m], continued to `end`; NaN where the branch ends."""
+        y, gone, piece = y.copy(), np.zeros(len(y)), np.ones(len(y))
+        usual = _sizes(y)
+        for _ in range(PIECES):
+            rows = np.flatnonzero((gone < 1) & (piece >= SHORTEST))
+            if not len(rows):
+                break
+            aim = np.minimum(gone[rows] + piece[rows], 1.0)
+            here, there = (begin[rows] + share[:, None] * (end - begin)[rows] for share in (gone[rows], aim))
+            moved = (guess(there.T).full() - guess(here.T).full()).T / self.unit
+            found = self.contracted(y[rows] + moved, there, usual)
+            good = np.isfinite(found).all(axis=1)
+            y[rows[good]], gone[rows[good]] = found[good], aim[good]
+            piece[rows] *= np.where(good, 2.0, 0.5)
+        y[gone < 1] = np.nan
+        return y
 
-    def check_index(self, v: Array, z: Array) -> None:
-        """ValueError where dg/dz is singular, or of another sign than elsewhere, at solutions z [B, n]."""
-        _, J = self.at(np.nan_to_num(z), v)
-        signs = np.array([_sign(j) for j in J])
-        lost = ~np.isfinite(z).all(axis=1) & ~(self.linear & (signs == 0))
+    def check(self, v: Array, y: Array, linear: bool = False) -> None:
+        """ValueError where there are no solutions y [B, n], or dg/dz is singular there, or of another sign."""
+        signs = np.array([_sign(j) for j in self.at(np.nan_to_num(y), v)[1]])
+        found = np.isfinite(y).all(axis=1) & np.isfinite(signs)
+        lost = ~found & ~(linear & (signs == 0))
         if lost.any():
             k = int(np.flatnonzero(lost)[0])
-            raise ValueError(f"{self.owner}: no {_names(self.z)} solve 0 = alg at {self.inputs.said(v[k])}; expected a "
-                             "solution all over the box: change the equations, shrink lbx, ubx, or give z_guess, "
-                             "numbers or expressions of x, u and p near the solution")
+            raise ValueError(f"{self.owner}: no {_names(self.z)} solve 0 = alg at {self.box.said(v[k])}, or none that "
+                             "is continued smoothly from the middle of the box; expected a solution all over the box: "
+                             "change the equations, shrink lbx, ubx, or give z_guess, numbers or expressions of x, u "
+                             "and p near the solution")
         for bad, what in ((signs == 0, "are singular in z (index 2 or more)"),
                           (signs != signs[0], "have solutions on another branch, beyond a singular point,")):
             if bad.any():
                 k = int(np.flatnonzero(bad)[0])
-                raise ValueError(f"{self.owner}: the equations alg {what} at {self.inputs.said(v[k])}, "
-                                 f"{self._said(z[k])}; expected one smooth solution all over the box: shrink lbx, "
-                                 "ubx, or give z_guess on the branch that is meant")
+                raise ValueError(f"{self.owner}: the equations alg {what} at {self.box.said(v[k])}{self._said(y[k])}; "
+                                 "expected one smooth solution all over the box: shrink lbx, ubx, or give z_guess on "
+                                 "the branch that is meant")
+
+    def check_width(self, y: Array) -> None:
+        """ValueError where z is of so many sizes that no step is small for all."""
+        size, small = np.abs(y).max(axis=0), np.quantile(np.abs(y), 0.05, axis=0)
+        for i in np.flatnonzero((small > 0) & (small < WIDE * size)):
+            raise ValueError(f"{self.owner}: {ca.vertsplit(self.z)[i].name()} is {size[i] * self.unit[i]:.3g} in one "
+                             f"part of the box and below {small[i] * self.unit[i]:.3g} in another; expected values of "
+                             "a few decades: make its logarithm the algebraic variable")
+
+    def _said(self, y: Array) -> str:
+        if not np.isfinite(y).all():
+            return ""
+        return "".join(f", {s.name()} = {value:.4g}"
+                       for s, value in zip(ca.vertsplit(self.z), y * self.unit, strict=True))
 
 
-def _by_newton(equations: Equations, guess: ca.SX) -> ca.SX:
+def _linear(z: ca.SX, g: ca.SX, box: Box, owner: str, checked: bool) -> ca.SX:
+    """z of equations that are linear in it."""
+    equations, v = Equations(z, g, box, owner), box.probes(0)
+    equations.balance(np.zeros((len(v), z.numel())), v)
+    rest, J = equations.both(ca.DM.zeros(z.numel()), box.column)
+    found = ca.densify(ca.DM(equations.unit) * ca.solve(J, -rest))
+    if checked:
+        y = equations.values_of(found, v)
+        equations.check(v, y, linear=True)
+        if not (np.abs(equations.step(y, v)) <= SOLVED * _sizes(y)).all():
+            raise ValueError(f"{owner}: alg is linear in {_names(z)}, and too close to singular to be solved; expected "
+                             "equations whose scales differ less: give z and alg units in which they are about 1")
+    return found
+
+
+def _by_newton(z: ca.SX, g: ca.SX, guess: ca.SX, box: Box, owner: str) -> ca.SX:
     """z by a fitted start and a few steps."""
-    box = equations.inputs
-    v, fresh = box.probes(0), box.probes(1)
-    z = _branch(equations, guess, v)
-    equations.check_index(v, z)
+    equations, v, fresh = Equations(z, g, box, owner), box.probes(0), box.probes(1)
+    equations.balance(equations.values_of(guess, v), v)
+    y = _branch(equations, guess, v)
+    equations.check(v, y)
+    y = equations.balance(y, v)
     truth = _branch(equations, guess, fresh)
-    equations.check_index(fresh, truth)
-    n, left = len(equations.moving), z - equations.values_of(guess, v)
-    degrees = [d for d in range(HIGHEST + 1) if math.comb(n + d, d) <= TERMS]
-    starts = [guess + _polynomial(equations, d, v, left) for d in degrees]
-    counts = [_needed(equations, start, fresh, truth) for start in starts]
-    if min(counts) > MOST:
-        raise ValueError(f"{equations.owner}: {_names(equations.z)} are not found by {MOST} steps of Newton's method "
-                         "from a polynomial fitted to solutions in the box; expected equations that are less bent in "
-                         "z: write them in other variables (a logarithm), shrink lbx, ubx, or give z_guess, "
-                         "expressions of x, u and p near the solution")
-    chosen = next(i for i, count in enumerate(counts) if count <= min(counts) + DEARER)
-    return _written_out(equations, starts[chosen], counts[chosen], _sizes(z))
+    equations.check(fresh, truth)
+    equations.check_width(truth)
+    left = y - equations.values_of(guess, v)
+    best, start = MOST + 1, ca.SX()
+    for degree in (d for d in range(HIGHEST + 1) if math.comb(len(equations.moving) + d, d) <= TERMS):
+        tried = guess / ca.DM(equations.unit) + _polynomial(equations, degree, v, left)
+        count = _needed(equations, tried, fresh, truth)
+        if count < best:
+            best, start = count, tried
+        if best <= SOON:
+            break
+    if best > MOST:
+        raise ValueError(f"{owner}: {_names(z)} are not found by {MOST} steps of Newton's method from a polynomial "
+                         "fitted to solutions in the box; expected equations that are less bent in z: write them in "
+                         "other variables (a logarithm), shrink lbx, ubx, or give z_guess, expressions of x, u and p "
+                         "near the solution")
+    return _written_out(equations, start, best, _sizes(truth))
 
 
 def _branch(equations: Equations, guess: ca.SX, v: Array) -> Array:
-    """Solutions at points v [B, n], each from the nearest known one, the first from the guess."""
-    shares = equations.inputs.shares(v)
+    """Solutions at points v [B, m], each continued from the nearest known one, the first from the guess."""
+    shares, of = equations.box.shares(v), ca.Function("guess", [equations.box.column], [guess])
     order = np.argsort((shares**2).sum(axis=1))
-    z = np.full((len(v), equations.n), np.nan)
+    y = np.full((len(v), equations.n), np.nan)
     first = order[:1]
-    z[first] = equations.solve(equations.values_of(guess, v[first]), v[first])
+    y[first] = equations.solve(equations.values_of(guess, v[first]), v[first])
     known, begin, many = first, 1, FIRST
-    while begin < len(v) and np.isfinite(z[first]).all():
+    while begin < len(v) and np.isfinite(y[first]).all():
         these = order[begin:begin + many]
-        far = ((shares[these, None] - shares[None, known]) ** 2).sum(axis=2)
-        z[these] = equations.solve(z[known[far.argmin(axis=1)]], v[these])
-        known = np.r_[known, these[np.isfinite(z[these]).all(axis=1)]]
+        near = known[((shares[these, None] - shares[None, known]) ** 2).sum(axis=2).argmin(axis=1)]
+        y[these] = equations.follow(y[near], v[near], v[these], of)
+        known = np.r_[known, these[np.isfinite(y[these]).all(axis=1)]]
         begin, many = begin + many, 2 * many
-    return z
+    return y
 
 
 def _polynomial(equations: Equations, degree: int, v: Array, values: Array) -> ca.SX:
     """The least-squares polynomial, in the inputs that the equations hold, through values [B, n]."""
-    box, moving = equations.inputs, equations.moving
+    box, moving = equations.box, equations.moving
     half, middle = (box.high - box.low)[moving] / 2, (box.high + box.low)[moving] / 2
     where = (box.column[moving] - ca.DM(middle)) / ca.DM(half)
     symbols = ca.vertsplit(ca.fmin(ca.fmax(where, -BEYOND), BEYOND))  # Newton's steps forget where they began, and how
@@ -214,30 +291,52 @@ def _polynomial(equations: Equations, degree: int, v: Array, values: Array) -> c
 
 
 def _needed(equations: Equations, start: ca.SX, v: Array, truth: Array) -> int:
-    """Undamped steps from a start to the true solutions, and two more; more than MOST where they do not get there."""
-    z, size = equations.values_of(start, v), _sizes(truth)
-    for count in range(MOST + 1):
-        if (np.abs(z - truth) / size).max() < NEAR:
+    """Undamped steps from a start, in units of y, to the true solutions, and two more; more than MOST where they do not
+    get there."""
+    y, size = equations.values_of(ca.DM(equations.unit) * start, v), _sizes(truth)
+    for count in range(MOST - 1):
+        if (np.abs(y - truth) / size).max() < NEAR:
             return count + 2
-        z = z - equations.step(z, v)
-    return MOST + 3
+        y = y - equations.step(y, v)
+    return MOST + 1
 
 
 def _written_out(equations: Equations, start: ca.SX, steps: int, size: Array) -> ca.SX:
-    """Newton's steps as an expression; NaN where the last one is not small."""
-    z, at = start, equations.inputs.column
+    """z by Newton's steps as an expression; NaN where the last one is not small."""
+    y, at = start, equations.box.column
     step = ca.SX.zeros(equations.n)
     for _ in range(steps):
-        g, J = equations.both(z, at)
+        g, J = equations.both(y, at)
         step = ca.solve(J, g)
-        z = z - step
-    return z + UNSEEN * ca.log(LOST**2 - ca.sumsqr(step / ca.DM(size)))
+        y = y - step
+    return ca.densify(ca.DM(equations.unit) * (y + UNSEEN * ca.log(LOST**2 - ca.sumsqr(step / ca.DM(size)))))
 
 
-def _sizes(z: Array) -> Array:
-    """Usual values of each z [n], of those that are known."""
-    usual = np.nanmax(np.abs(np.where(np.isfinite(z), z, 0.0)), axis=0)
-    return np.where(usual > 0, usual, max(usual.max(), 1e-300) if usual.size else 1.0)
+def _units(entries: Array) -> tuple[Array, Array]:
+    """(of rows, of columns), powers of 2, by which the largest entries of a matrix [n, n] become about 1."""
+    rows, columns = np.ones(len(entries)), np.ones(len(entries))
+    for _ in range(BALANCED):
+        now = rows[:, None] * entries * columns
+        rows /= _root(now.max(axis=1))
+        now = rows[:, None] * entries * columns
+        columns /= _root(now.max(axis=0))
+    return np.exp2(np.round(np.log2(rows))), np.exp2(np.round(np.log2(columns)))
+
+
+def _root(values: Array) -> Array:
+    return np.where(values > 0, np.sqrt(values), 1.0)
+
+
+def _sizes(y: Array) -> Array:
+    """Usual values of each y [n], of those that are known."""
+    usual = np.abs(np.where(np.isfinite(y), y, 0.0)).max(axis=0)
+    return np.where(usual > 0, usual, max(usual.max(), 1e-300))
+
+
+def _large(step: Array, size: Array) -> float:
+    """The largest share; inf where it is NaN."""
+    share = float((np.abs(step) / size).max())
+    return share if math.isfinite(share) else math.inf
 
 
 def _inverses(J: Array) -> Array:
@@ -255,9 +354,11 @@ def _times(matrices: Array, columns: Array) -> Array:
 
 
 def _sign(J: Array) -> float:
-    """Of det J; 0 where it is singular, whatever the units of its rows and columns."""
-    rows = J / np.maximum(np.abs(J).max(axis=1, keepdims=True), 1e-300)
-    even = rows / np.maximum(np.abs(rows).max(axis=0, keepdims=True), 1e-300)
+    """Of det J; 0 where it is singular, whatever the units of its rows and columns; NaN where J is not finite."""
+    if not np.isfinite(J).all():
+        return math.nan
+    rows, columns = _units(np.abs(J))
+    even = rows[:, None] * J * columns
     values = np.linalg.svd(even, compute_uv=False)
     return 0.0 if values[-1] <= REGULAR * values[0] else float(np.linalg.slogdet(even)[0])
 

@@ -62,7 +62,8 @@ def limit_rates(system: System, rates: Mapping[str, float]) -> System:
     return System(f"{system.name}_rates", x=ca.vertcat(at["x"], *(part[0] for part in slow)), u=ca.vertcat(*u),
                   xdot=ca.vertcat(at.call(system.f), *(fresh[name][0] for name in most)), lbu=lbu, ubu=ubu,
                   lbx=np.r_[system.lbx, [part[1] for part in slow]], ubx=np.r_[system.ubx, [part[2] for part in slow]],
-                  p=at.symbols.get("p"), z=system.z, alg=system.alg, angles=system.angles, units=dict(system.units))
+                  p=at.symbols.get("p"), z=system.z, alg=system.alg, z_guess=system.z_guess,
+                  angles=system.angles, units=dict(system.units))
 
 
 @dataclass(frozen=True)

@@ -127,7 +127,7 @@ class OCP:
         self._set(p=known.column(self.p, owner))
         check_unique((*s.names, *self.parameter_names), False, owner)
         if s.z.numel():
-            self._set(**{name: s.without_z(getattr(self, name)) for name in HOLD_Z})
+            s = self._solve_z(s)
         t, p = known.time(), self._all_p
         self._check_constraints(owner)
         self._set(terminal=self._end(owner))
@@ -152,6 +152,14 @@ class OCP:
     def _set(self, **values: object) -> None:
         for key, value in values.items():
             object.__setattr__(self, key, value)
+
+    def _solve_z(self, s: System) -> System:
+        """The system, with its algebraic variables solved for all over the problem; its expressions without them."""
+        d = self.parameters
+        where = box(d) if isinstance(d, (Gaussian, Uniform)) and d.n == self.np else (self.nominal, self.nominal)
+        s = s.over(self.longest, *(bound[:s.np] for bound in where))
+        self._set(system=s, **{name: s.without_z(getattr(self, name)) for name in HOLD_Z})
+        return s
 
     def _check_constraints(self, owner: str) -> None:
         s, t = self.system, known.time()
@@ -674,7 +682,7 @@ class OCP:
         bounds (bang-bang), or is singular. Where f is not known, those that L is linear in.
         """
         s = self.system
-        return tuple(linear_controls(self.running, ca.SX(0, 1) if s.xdot is None else s.xdot, s.u))
+        return tuple(linear_controls(self.running, ca.SX(0, 1) if s.xdot is None else s.equations, s.u))
 
     @classmethod
     def quadratic(cls, system: System, *, x_goal: Vector, u_goal: Vector, R: Vector = 0.01, P: Vector = 1.0,

@@ -200,6 +200,9 @@ def split_controls(system: System, names: Sequence[str]) -> System:
     units = {n: unit for n, unit in system.units.items() if n not in names}
     units |= {f"{n}_{side}": system.units[n] for n, side in itertools.product(names, ("plus", "minus"))
               if n in system.units}
-    xdot, alg = at.given(u=ca.vertcat(*value)).call(system.f), ca.substitute(system.alg, at["u"], ca.vertcat(*value))
+    xdot = at.given(u=ca.vertcat(*value)).call(system.f)
+    alg, guess = (e if e is None else ca.substitute(e, at["u"], ca.vertcat(*value))
+                  for e in (system.alg, system.z_guess))
     return System(f"{system.name}_split", x=at["x"], u=ca.vertcat(*parts), xdot=xdot, lbu=lb, ubu=ub, lbx=system.lbx,
-                  ubx=system.ubx, p=at.symbols.get("p"), z=system.z, alg=alg, angles=system.angles, units=units)
+                  ubx=system.ubx, p=at.symbols.get("p"), z=system.z, alg=alg, z_guess=guess, angles=system.angles,
+                  units=units)

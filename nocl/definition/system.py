@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any
@@ -44,8 +44,8 @@ class System:
         A column of parameters, nocl.parameter(name, nominal, unit): constant along a trajectory (a mass, a length).
     z, alg : casadi.SX, optional
         Algebraic variables [nz], symbols that xdot may hold, and as many equations 0 = alg(x, z, u, t, p) of index 1.
-        They are solved for z (nocl/definition/algebraic.py), once: xdot then holds no z, `alg` is z less its solution,
-        `algebraic` gives z, and costs and constraints of an OCP may hold z too.
+        They are solved for z once, in the box of x and u (nocl/definition/algebraic.py): `equations` are xdot with the
+        solution in place of z, `algebraic` gives it, and costs and constraints of an OCP may hold z too.
     z_guess : [nz], numbers or expressions of x, u and p
         Near which solution z is looked for; default 0.
     lbu, ubu : [nu]
@@ -76,6 +76,7 @@ class System:
     z_guess: Any = field(default=None, kw_only=True)
     angles: Sequence[str] = field(default=(), kw_only=True)
     units: Mapping[str, str] = field(default_factory=dict, kw_only=True)
+    _solution: ca.SX = field(default=_NONE, init=False)  # z
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", self.name):
@@ -89,9 +90,10 @@ class System:
         lbu, ubu = checks.bounds(self.lbu, self.ubu, self.nu, ("lbu", "ubu"), owner, self.control_names)
         lbx, ubx = checks.bounds(self.lbx, self.ubx, self.nx, ("lbx", "ubx"), owner, self.state_names)
         self._set(lbu=lbu, ubu=ubu, lbx=lbx, ubx=ubx)
-        self._set_algebraic(owner)
+        self._read_algebraic(owner)
         if self.xdot is not None:
             self._set(xdot=self._expression(self.xdot, self.nx, "xdot", owner))
+        self._solve_algebraic()
         check_unique((*self.names, *self.parameter_names, *self.algebraic_names), self.uses_time, owner)
         self._check_names(owner)
         if self.xdot is not None:
@@ -101,32 +103,51 @@ class System:
         for key, value in values.items():
             object.__setattr__(self, key, value)
 
-    def _expression(self, value: Any, rows: int, name: str, owner: str, z: ca.SX = _NONE) -> ca.SX:
-        """A column in x, u, t, p and z, without z; ValueError for any other."""
-        own, t = ca.vertcat(self.x, self.u, self.p), parameters.time()
-        e = checks.expression(checks.column(value), rows, ca.vertcat(own, self.z, z), name, owner, time=t)
-        instructions.check_scalar(ca.Function(name, [ca.vertcat(own, self.z, z), t], [e]), f"{owner}: {name}")
-        return checks.FrozenSX(self.without_z(e))
+    def _expression(self, value: Any, rows: int, name: str, owner: str, z: bool = True) -> ca.SX:
+        """A column in x, u, t, p and, if `z`, the algebraic variables; ValueError for any other."""
+        own, t = ca.vertcat(self.x, self.u, self.p, *([self.z] if z else [])), parameters.time()
+        value = list(value) if isinstance(value, np.ndarray) else value
+        e = checks.expression(checks.column(value), rows, own, name, owner, time=t)
+        instructions.check_scalar(ca.Function(name, [own, t], [e]), f"{owner}: {name}")
+        return e
 
-    def _set_algebraic(self, owner: str) -> None:
-        """z, solved for, as symbols and `alg`, z less its solution; empty where there is none."""
-        if self.z is None or (isinstance(self.z, ca.SX) and self.z.is_empty()):
-            if self.alg is not None and not (isinstance(self.alg, ca.SX) and self.alg.is_empty()):
-                raise ValueError(f"{owner}: alg is given and z is not; expected the symbols that it is solved for, z=")
-            return self._set(z=_NONE, alg=_NONE, z_guess=None)
-        z = checks.FrozenSX(ca.vertcat(*checks.symbols(checks.column(self.z), "z", owner)))
-        check_unique((*self.names, *self.parameter_names, *(s.name() for s in ca.vertsplit(z))), False, owner)
-        self._set(z=_NONE)
-        if self.alg is None:
-            raise ValueError(f"{owner}: z is given and alg is not; expected {counted(z.numel(), 'equation')} 0 = alg, "
-                             "expressions of x, z, u and p")
-        g = self._expression(self.alg, z.numel(), "alg", owner, z)
-        given = [0.0] * z.numel() if self.z_guess is None else self.z_guess
-        guess = self._expression(list(given) if isinstance(given, np.ndarray) else given, z.numel(), "z_guess", owner)
-        known = algebraic.Box({"x": self.x, "u": self.u, "t": parameters.time(), "p": self.p},
-                              np.r_[self.lbx, self.lbu], np.r_[self.ubx, self.ubu], self.nominal)
-        solution = algebraic.solved(z, g, guess, known, owner)
-        return self._set(z=z, alg=checks.FrozenSX(z - solution), z_guess=None)
+    def _read_algebraic(self, owner: str) -> None:
+        """z, alg and z_guess as columns, empty where there are none."""
+        z, alg, guess = (None if _is_nothing(e) else e for e in (self.z, self.alg, self.z_guess))
+        if z is None and (alg is not None or guess is not None):
+            raise ValueError(f"{owner}: {'alg' if alg is not None else 'z_guess'} is given and z is not; expected the "
+                             "symbols that alg is solved for, z=")
+        parts = [] if z is None else checks.symbols(checks.column(z), "z", owner)
+        if parts and alg is None:
+            raise ValueError(f"{owner}: z is given and alg is not; expected {counted(len(parts), 'equation')} "
+                             "0 = alg, expressions of x, z, u and p")
+        self._set(z=checks.FrozenSX(ca.vertcat(ca.SX(0, 1), *parts)))
+        check_unique((*self.names, *self.parameter_names, *self.algebraic_names), False, owner)
+        self._set(alg=self._expression(alg, len(parts), "alg", owner) if parts else _NONE,
+                  z_guess=self._expression([0.0] * len(parts) if guess is None else guess, len(parts), "z_guess", owner,
+                                           z=False) if parts else None)
+
+    def _solve_algebraic(self, longest: float = 0.0, low: Array | None = None, high: Array | None = None) -> None:
+        """z as expressions of x and u in their boxes, t in [0, longest] and p in [low, high], nominal ones by default.
+        """
+        if not self.z.numel():
+            return self._set(_solution=_NONE)
+        low, high = (self.nominal if bound is None else bound for bound in (low, high))
+        box = algebraic.Box({"x": self.x, "u": self.u, "t": parameters.time(), "p": self.p},
+                            np.r_[self.lbx, self.lbu, 0.0, low], np.r_[self.ubx, self.ubu, longest, high])
+        solution = algebraic.solved(self.z, self.alg, self.z_guess, box, f"System {self.name!r}")
+        return self._set(_solution=solution)
+
+    def over(self, longest: float, low: Array, high: Array) -> System:
+        """The system for times in [0, longest] and parameters [np] in [low, high]: what algebraic variables are solved
+        for, where that counts."""
+        moving = ca.vertcat(parameters.time(), self.p)
+        if not self.z.numel() or not algebraic.changes(self.alg, self.z, moving):
+            return self
+        other = object.__new__(System)
+        other._set(**{one.name: getattr(self, one.name) for one in fields(self)})
+        other._solve_algebraic(longest, low, high)
+        return other
 
     def without_z(self, e: Any) -> Any:
         """An expression, or a mapping or a tuple that holds some, with the solution in place of algebraic variables."""
@@ -136,10 +157,6 @@ class System:
             return type(e)(map(self.without_z, e))
         held = isinstance(e, ca.SX) and self.z.numel() and ca.depends_on(e, self.z)
         return ca.substitute(e, self.z, self._solution) if held else e
-
-    @property
-    def _solution(self) -> ca.SX:
-        return -ca.substitute(self.alg, self.z, ca.DM.zeros(self.z.numel()))
 
     def _check_names(self, owner: str) -> None:
         angles = (self.angles,) if isinstance(self.angles, str) else self.angles
@@ -224,7 +241,7 @@ class System:
     @cached_property
     def uses_time(self) -> bool:
         """Whether xdot holds the time."""
-        known = self.alg if self.xdot is None else ca.vertcat(self.xdot, self.alg)
+        known = self._solution if self.xdot is None else ca.vertcat(self.equations, self._solution)
         return bool(ca.depends_on(known, parameters.time()))
 
     def refuse_parameters(self, owner: str) -> None:
@@ -238,12 +255,16 @@ class System:
 
     @property
     def equations(self) -> ca.SX:
-        """xdot; ValueError where it is not known."""
+        """xdot, without algebraic variables; ValueError where it is not known."""
         if self.xdot is None:
             raise ValueError(f"the equations of {self.name!r} are not known (xdot=None), and are needed here: learn "
                              "them from logs, model = nocl.identify(system, data=log), and pass the model, or a "
                              "problem on model.to_system()")
-        return self.xdot
+        return self._equations
+
+    @cached_property
+    def _equations(self) -> ca.SX:
+        return checks.FrozenSX(self.without_z(self.xdot))
 
     @cached_property
     def arguments(self) -> Arguments:
@@ -284,8 +305,12 @@ class System:
         """The system with its parameters folded in as constants: p as [np], or by name."""
         value = parameters.rows(p, self.parameter_names, 1, f"{self.name}.at")[0]
         units = {n: unit for n, unit in self.units.items() if n not in self.parameter_names}
-        xdot, alg = (None if e is None else ca.substitute(e, self.p, ca.DM(value)) for e in (self.xdot, self.alg))
-        return replace(self, xdot=xdot, alg=alg, p=None, units=units)
+
+        def folded(e: Any) -> Any:
+            return e if e is None else ca.substitute(e, self.p, ca.DM(value))
+
+        return replace(self, xdot=folded(self.xdot), alg=folded(self.alg), z_guess=folded(self.z_guess), p=None,
+                       units=units)
 
     def with_inputs(self, low: Array, high: Array) -> System:
         """f(x, u, p) as f(x, (u, p)): the parameters after the controls, between low and high [np]."""
@@ -331,7 +356,7 @@ class System:
 
     def unit(self, name: str) -> str:
         """The unit of a state, control or parameter for an axis label, like 'theta [rad]' or just 'theta'."""
-        checks.word(name, (*self.names, *self.parameter_names), "name", f"{self.name}.unit")
+        checks.word(name, (*self.names, *self.parameter_names, *self.algebraic_names), "name", f"{self.name}.unit")
         return f"{name} [{self.units[name]}]" if name in self.units else name
 
     def __repr__(self) -> str:
@@ -343,11 +368,14 @@ class System:
         if self.xdot is None:
             lines.append("equations not known")
         else:
-            rows, shared = pretty.lines(self.xdot, ca.vertcat(*self.arguments.inputs))
-            lines += [pretty.wrapped(f"d{n}/dt", e) for n, e in zip(self.state_names, rows, strict=True)]
+            rows, shared = pretty.lines(ca.vertcat(self.xdot, self.alg), ca.vertcat(*self.arguments.inputs, self.z))
+            names = [*(f"d{n}/dt" for n in self.state_names), *["0"] * self.z.numel()]
+            lines += [pretty.wrapped(n, e) for n, e in zip(names, rows, strict=True)]
             lines += [pretty.wrapped(name, e, "    ") for name, e in shared.items()]
         lines.append(pretty.filled("X: " + ", ".join(map(interval, self.state_names, self.lbx, self.ubx))))
         lines.append(pretty.filled("U: " + ", ".join(map(interval, self.control_names, self.lbu, self.ubu))))
+        if self.z.numel():
+            lines.append(pretty.filled("z: " + ", ".join(self.algebraic_names)))
         if self.np:
             lines.append(pretty.filled("p: " + parameter_text(self.p)))
         return "\n".join(lines)
@@ -371,8 +399,8 @@ class System:
             p = parameters.from_data(data.get("p", ()))
             at = {"x": x, "u": u, parameters.TIME: parameters.time(), "p": p}
             xdot = None if data["f"] is None else read(data["f"], at)
-            z = ca.vertcat(*map(ca.SX.sym, data["z"])) if "z" in data else None
-            alg = None if z is None else z - read(data["z_is"], at)
+            z = ca.vertcat(ca.SX(0, 1), *map(ca.SX.sym, data.get("z", ())))
+            alg = z - read(data["z_is"], at) if "z_is" in data else None
             return System(data["name"], x=x, u=u, xdot=xdot, p=p, z=z, alg=alg, angles=data["angles"],
                           units=data["units"], **{name: data[name] for name in ("lbu", "ubu", "lbx", "ubx")})
         except MALFORMED as error:
@@ -410,6 +438,11 @@ def _named(names: Sequence[str] | None, n: int, letter: str, what: str, owner: s
     if len(chosen) != n:
         raise ValueError(f"System.from_casadi: {what} has {len(chosen)} names; {owner} has {n}: give each a name")
     return ca.vertcat(*map(ca.SX.sym, chosen))
+
+
+def _is_nothing(e: Any) -> bool:
+    """None, or an empty list or column."""
+    return e is None or (isinstance(e, (list, tuple)) and not e) or (isinstance(e, ca.SX) and e.is_empty())
 
 
 def check_unique(names: Sequence[str], timed: bool, owner: str) -> None:

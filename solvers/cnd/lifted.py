@@ -42,9 +42,10 @@ class Lifted:
         s, p = self.of.system, self.of.parameters
         low, high = (np.zeros(0), np.zeros(0)) if p is None else open_box(p)
         known = [1.0] * len(self.clock) + [0.0] * self.of.np
-        xdot = None if s.xdot is None else ca.vertcat(self._at(s.xdot), *known)
+        xdot = None if s.xdot is None else ca.vertcat(self._at(s.equations), *known)
         T = [self.of.horizon] * len(self.clock)
-        return replace(s, x=ca.vertcat(s.x, *self.clock, self.p), p=None, xdot=xdot, units={},
+        return replace(s, x=ca.vertcat(s.x, *self.clock, self.p), p=None, xdot=xdot, z=None, alg=None,
+                       z_guess=None, units={},
                        lbx=np.r_[s.lbx, np.zeros(len(T)), low], ubx=np.r_[s.ubx, T, high])
 
     def _box(self) -> Uniform:
