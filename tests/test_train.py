@@ -247,7 +247,8 @@ def test_value_scores_are_zero_for_the_exact_value():
     assert row["tails_slope_error"] < 1e-4
     assert row["hjb_mean"] < 1e-10
     twice = value_scores(lambda X, T: 2 * value(X, T), policy, InTorch(ocp), optima)
-    assert twice["initial_error"] == pytest.approx(1.0, abs=1e-3)
+    of_usual = starts.cost / (starts.cost + 0.1 * starts.cost.mean())  # what costs next to nothing is no measure
+    assert twice["initial_error"] == pytest.approx(of_usual.mean(), abs=1e-3)
     assert twice["initial_slope_error"] == pytest.approx(1.0, abs=1e-3)
     assert twice["hjb_mean"] > 0.1
 

@@ -8,7 +8,7 @@ never a number that does not solve the equations.
 
 Solutions in the box are continued from each other, beginning in its middle, by steps in which Newton's method contracts
 at once, so that they belong to one branch: det(dg/dz) is nowhere 0 (the DAE has index 1) and nowhere of another sign.
-A pole that is far narrower than the box is not seen: pH, not the concentration of ions, is a variable for Newton's method.
+A pole that is far narrower than the box is not seen: pH, not the ions' concentration, is a variable for Newton.
 All is done in units of z and of the equations in which the entries of dg/dz are about 1.
 """
 

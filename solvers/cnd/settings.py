@@ -83,8 +83,8 @@ class TrainSettings(Scaled):
     value_visits: int = count(3000, "more of them, from states that the policy visits under kicks")
     value_iterations: int = count(7000, "of the first fit of V; twice as many of further ones")
     value_rounds: int = count(3, "fits of V at most: each further one on as many labels more")
-    value_error: float = positive(2.5e-3, "stop once met: mean of |V - J*| / J* at held-out initial, tube and kicked "
-                                  "states")
+    value_error: float = positive(2.5e-3, "stop once met: mean of |V - J*| / (J* + a tenth of a usual J*) at held-out "
+                                  "initial, tube and kicked states")
     held_out: int = count(64, "initial states that tell when to stop")
     gap_median: float = positive(2e-4, "stop once both are met: (J - J*) / J*, median over the held-out states")
     gap_p95: float = positive(1e-3, "and its 95th percentile")

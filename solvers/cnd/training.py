@@ -91,7 +91,7 @@ if TYPE_CHECKING:
 
 __all__ = ["TrainSettings", "train"]
 CHECKPOINT = "training.safetensors"
-VALUE_LARGE = 0.05  # mean |V - J*| / J* that a warning is given above
+VALUE_LARGE = 0.05  # mean error of V (validate.value_scores) that a warning is given above
 MARGINS = 3  # rounds that begin with new margins, where there are constraints
 LOSSES = 40  # of each regression that the card keeps
 REHEARSED = (16, 16)  # points inside the box, and corners, at which an export is tried before training

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline, PchipInterpolator
 from torch import Tensor
 
@@ -24,10 +26,12 @@ from nocl.solvers.cnd.regression.labels import (
     tube_states,
 )
 from nocl.solvers.ddp.bank import SolutionBank, extend
+from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
 
 FLOOR = 0.5  # of the gap, that explains it
+COLD = 4  # starts of held-out states that the bank's solutions do not lead to
 NODES = 16  # of each solution at which the HJB residual is taken
 
 
@@ -44,8 +48,15 @@ def solved_again(fine: DDP, coarse: Solution) -> Solution:
 
 
 def held_out(ddp: DDP, fine: DDP, bank: SolutionBank, fresh: Problems) -> Solution:
-    """Fresh initial states, solved from the bank's nearest."""
-    return solved_again(fine, extend(ddp, bank, fresh.x, p=fresh.given_p))
+    """Fresh initial states, solved from the bank's nearest; where that fails, from cold starts."""
+    found = extend(ddp, bank, fresh.x, p=fresh.given_p)
+    lost = np.flatnonzero(~found.success & ~_infeasible(found))
+    if len(lost):
+        p = None if fresh.given_p is None else fresh.given_p[lost]
+        again = solve_globally(ddp, fresh.x[lost], p=p, starts=COLD, rounds=1, progress=False)
+        found = replace(found, tried=None)
+        found.put(lost[again.success], again[again.success])
+    return solved_again(fine, found)
 
 
 def held_out_optima(ddp: DDP, fine: DDP, bank: SolutionBank, fresh: Problems) -> Solution:
@@ -56,7 +67,11 @@ def held_out_optima(ddp: DDP, fine: DDP, bank: SolutionBank, fresh: Problems) ->
 
 def cannot_hold(s: Solution) -> int:
     """How many were not solved because nothing was found that holds their constraints."""
-    return int(np.char.startswith(s.message[~s.success], "infeasible").sum())
+    return int(_infeasible(s).sum())
+
+
+def _infeasible(s: Solution) -> NDArray[np.bool_]:
+    return ~s.success & np.char.startswith(s.message, "infeasible")
 
 
 def kicked_optima(ddp: DDP, fine: DDP, bank: SolutionBank, policy: Policy, torch_ocp: InTorch, n: int, kick: float,
@@ -163,16 +178,18 @@ def summary(shares: Array, name: str) -> dict[str, float]:
 
 def value_scores(value: FeatureNet, policy: Policy, torch_ocp: InTorch,
                  optima: dict[str, Solution]) -> dict[str, float]:
-    """|V - J*| / |J*| (mean and median), V_x against costates (medians) of each set of optima; the HJB residual.
+    """|V - J*| / (|J*| + J_small) (mean and median), V_x against costates (medians) of each set of optima; the HJB
+    residual.
 
-    Slopes are by usual states, so that units change nothing. The residual V_t + L + V_x' f is taken at the policy's u
-    along the last set, in units of its mean running cost.
+    J_small is SMALL of the mean |J*| of the first set: a tail that costs next to nothing is no measure. Slopes are by
+    usual states, so that units change nothing. The residual V_t + L + V_x' f is taken at the policy's u along the last
+    set, in units of its mean running cost.
     """
     row: dict[str, float] = {}
-    usual = usual_sizes(torch_ocp.ocp).x
+    usual, small = usual_sizes(torch_ocp.ocp).x, SMALL * np.abs(next(iter(optima.values())).cost).mean()
     for name, s in optima.items():
         V, V_x = _value_and_slope(value, s.x[:, 0], s.t[:, 0], torch_ocp.at(s.parameters).p)
-        error = np.abs(V - s.cost) / np.abs(s.cost)
+        error = np.abs(V - s.cost) / (np.abs(s.cost) + small)
         row |= {f"{name}_error": float(error.mean()), f"{name}_error_median": float(np.median(error))}
         slope, costate = V_x * usual, s.V_x[:, 0] * usual
         size, true = np.linalg.norm(slope, axis=1), np.linalg.norm(costate, axis=1)
