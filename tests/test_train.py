@@ -15,7 +15,7 @@ from nocl.hjb import hjb_residual
 from nocl.judge import simulate
 from nocl.nets import MLP, FeatureNet
 from nocl.solvers import LQR, NMPC
-from nocl.solvers.cnd import TrainSettings
+from nocl.solvers.cnd import TrainSettings, validate
 from nocl.solvers.cnd.regression.features import policy_net
 from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.cnd.regression.labels import (
@@ -29,7 +29,7 @@ from nocl.solvers.cnd.regression.labels import (
     tube,
 )
 from nocl.solvers.cnd.regression.regress import fit_net, policy_loss
-from nocl.solvers.cnd.validate import advice, gap, refined, summary, value_scores
+from nocl.solvers.cnd.validate import advice, gap, held_out, refined, summary, value_scores
 from nocl.solvers.cnd.value import ROUND, ValueLabels, on_fine_grid, value_loss, value_net, value_tails
 from nocl.solvers.ddp.bank import SolutionBank, extend
 from nocl.solvers.ddp.global_search import solve_globally
@@ -227,6 +227,25 @@ def test_the_gap_counts_from_any_time_and_a_policy_that_blows_up_is_infinitely_b
 
         assert gap(feedback, InTorch(ocp), own[i:i + 1]) == pytest.approx(0.0, abs=2e-3)
     assert summary(np.array([np.nan, np.nan, 0.0]), "gap") == {"gap_median": np.inf, "gap_p95": np.inf}
+
+
+def test_held_out_states_that_no_neighbour_leads_to_are_solved_from_cold_starts(monkeypatch):
+    ocp = nocl.load_ocp("pendulum")
+    ddp, fine = DDP(ocp, intervals=20), DDP(ocp, intervals=80)
+    fresh = Problems.initial(ocp, 4, np.random.default_rng(0))
+    bank = SolutionBank.of(ddp, ddp.solve(ocp.initial_states.sample(6, 1)))
+    whole = held_out(ddp, fine, bank, fresh)
+
+    def failing(*args, **options):
+        found = extend(*args, **options)
+        found.success[2], found.cost[2] = False, np.inf
+        return found
+
+    monkeypatch.setattr(validate, "extend", failing)
+    again = held_out(ddp, fine, bank, fresh)
+    assert again.success.all()
+    assert again.cost[2] <= whole.cost[2] * (1 + 1e-6)
+    np.testing.assert_array_equal(np.delete(again.cost, 2), np.delete(whole.cost, 2))
 
 
 def test_value_scores_are_zero_for_the_exact_value():

@@ -253,17 +253,13 @@ class System:
     def angle_indices(self) -> tuple[int, ...]:
         return tuple(self.state_names.index(a) for a in self.angles)
 
-    @property
+    @cached_property
     def equations(self) -> ca.SX:
         """xdot, without algebraic variables; ValueError where it is not known."""
         if self.xdot is None:
             raise ValueError(f"the equations of {self.name!r} are not known (xdot=None), and are needed here: learn "
                              "them from logs, model = nocl.identify(system, data=log), and pass the model, or a "
                              "problem on model.to_system()")
-        return self._equations
-
-    @cached_property
-    def _equations(self) -> ca.SX:
         return checks.FrozenSX(self.without_z(self.xdot))
 
     @cached_property
