@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from nocl import __version__
 from nocl.cli import arguments, reproduce
-from nocl.definition.substeps import INTEGRATORS, RADAU
+from nocl.definition.substeps import INTEGRATORS, RADAU, USUAL
 from nocl.solvers import registry
 from nocl.support.fields import EFFORTS
 from nocl.support.lock import alone
@@ -164,8 +164,9 @@ def _add(sub: argparse.ArgumentParser, *names: str) -> None:
         "minutes": ("--minutes", {"type": arguments.minutes, "metavar": "M",
                                   "help": "of wall-clock time for identification and training together: they are made "
                                           "to fit it, and the best controller so far is taken; default: no limit"}),
-        "intervals": ("--intervals", {"type": arguments.count, "default": 80, "metavar": "N",
-                                      "help": "of plans, of training's too; default: 80"}),
+        "intervals": ("--intervals", {"type": arguments.count, "metavar": "N", "help": "of plans, of training's too; "
+                                      f"default: {USUAL}, and for training twice or four times as many where plans "
+                                      "on these cost too much"}),
         "integrator": ("--integrator", {"choices": INTEGRATORS, "help": "of the steps in each interval: Runge and "
                                         "Kutta's, or implicit ones; default: the former, or the latter where they "
                                         "would be too many"}),
@@ -213,7 +214,7 @@ def _problem(args: argparse.Namespace) -> tuple[OCP, Path]:
 
 def _doctor(args: argparse.Namespace) -> None:
     ocp, doctor = load_ocp(args.problem), import_module("nocl.comparisons.diagnosis").doctor
-    found = doctor(ocp if args.p is None else ocp.at(args.p), args.intervals, args.seed)
+    found = doctor(ocp if args.p is None else ocp.at(args.p), args.intervals or USUAL, args.seed)
     print(found)
     if not found.ok:
         raise ValueError(f"doctor: {sum(one.verdict == 'PROBLEM' for one in found.findings)} problem(s), named above")
@@ -238,11 +239,11 @@ def _run(args: argparse.Namespace) -> None:
         _check_learnable(ocp, args.integrator)
     stages = RunFolder(ocp, out, args.seed, args.effort, args.minutes, args.intervals, args.integrator)
     stages.check(exact=args.exact)
-    _refuse(ocp, args.methods, registry.Options(args.intervals, args.seed))
+    _refuse(ocp, args.methods, registry.Options(args.intervals or USUAL, args.seed))
     with alone(out):
         cnd = stages.train(exact=args.exact)
         failed = _told(lambda: stages.export(cnd, out / "export", ("casadi", "c"), QUICK_PROOF))
-        stages.compare(cnd, out / "report", args.methods, args.n, args.intervals)
+        stages.compare(cnd, out / "report", args.methods, args.n, args.intervals or USUAL)
     if failed:
         raise failed
 
@@ -298,7 +299,7 @@ def _solve(args: argparse.Namespace) -> None:
         raise ValueError(f"nocl solve: --solver {args.solver} makes no plans on a grid and takes no --{ignored[0]}: "
                          "leave it out")
     with alone(out / "solutions"):
-        options = registry.Options(args.intervals, args.seed, args.substeps, args.integrator)
+        options = registry.Options(args.intervals or USUAL, args.seed, args.substeps, args.integrator)
         solve(ocp, out / "solutions", args.solver, args.n, options, args.workers, args.p)
 
 
@@ -321,9 +322,10 @@ def _compare(args: argparse.Namespace) -> None:
     out = args.out if args.out is not None else run / "report"
     arguments.check_out(out)
     seed = int(cnd.card.get("seed", 0)) if args.seed is None else args.seed
-    _refuse(cnd.ocp, args.methods, registry.Options(args.intervals, seed))
+    _refuse(cnd.ocp, args.methods, registry.Options(args.intervals or USUAL, seed))
     with alone(beside(out, run)):  # where outcomes so far are kept
-        RunFolder(cnd.ocp, run, seed).compare(cnd, out, args.methods, args.n, args.intervals, args.hold, args.robust)
+        RunFolder(cnd.ocp, run, seed).compare(cnd, out, args.methods, args.n, args.intervals or USUAL, args.hold,
+                                              args.robust)
 
 
 def _refuse(ocp: OCP, methods: Sequence[str], options: registry.Options) -> None:

@@ -30,6 +30,7 @@ from nocl.comparisons.studies import study
 from nocl.data import TINY
 from nocl.definition.ocp import OCP
 from nocl.definition.scales import usual_sizes
+from nocl.definition.substeps import USUAL
 from nocl.exports.bundle import export
 from nocl.judge.simulation import simulate
 from nocl.solvers import registry
@@ -45,7 +46,6 @@ from nocl.sysid.logs.log import Log
 PARTS = ("dynamics", "cnd", "export", "report", "checkpoint")  # folders in a run's folder
 KEY = "run"  # of a card: what the stage was made from
 COARSE = 0.01  # of a cost: where judge and plan differ by more, the plan's grid is too coarse
-INTERVALS = 80  # of training's plans, where nobody says
 IDENTIFYING = 0.3  # of a run's minutes, at most
 CHECKING = 0.2  # of those left then, for teaching it again
 JUDGED = 64  # plans of `nocl solve` that are run on the exact f
@@ -61,7 +61,7 @@ class RunFolder:
     seed: int
     effort: str = "normal"  # the word that scales all settings: "quick", "normal" or "best"
     minutes: float | None = None  # of identification and training together, from when this is made on
-    intervals: int = INTERVALS  # of training's plans
+    intervals: int | None = None  # of training's plans; None: as many as they need
     integrator: str | None = None  # of their steps; None: what fits
     begin: float = field(default_factory=time.monotonic)
 
@@ -123,7 +123,7 @@ class RunFolder:
         """The controller and value function, in cnd/; on dynamics/ unless exact."""
         model = None if exact else self._good_enough(self.identify(IDENTIFYING))
         data = {} if model is None else {k: v for k, v in model.card[KEY].items() if k in OF_LOGS}
-        grid: dict[str, Any] = {"intervals": self.intervals} if self.intervals != INTERVALS else {}
+        grid: dict[str, Any] = {} if self.intervals is None else {"intervals": self.intervals}
         grid |= {} if self.integrator is None else {"integrator": self.integrator}
         made_from, there = self._made_from(exact=exact, **grid, **data), self._cnd_there()
         if there is not None and there.card.get(KEY) == made_from:
@@ -154,7 +154,7 @@ class RunFolder:
         budget = ENDLESS if self.minutes is None else Budget(60 * self._minutes_left(CHECKING))
         try:
             better, loss = good_enough(self.ocp, model, wanted, Settings.of(self.effort), seed=self.seed,
-                                       intervals=self.intervals, budget=budget)
+                                       intervals=self.intervals or USUAL, budget=budget)
         except ValueError as error:  # what cannot be solved here, training tells with what to do
             say(f"dynamics: not held against the exact f: {error}")
             return model

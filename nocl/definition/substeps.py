@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from nocl.translate import radau
 
+USUAL = 80  # intervals, where nobody says
 RK4, RADAU = "rk4", "radau"
 INTEGRATORS = (RK4, RADAU)
 FINEST = 128  # steps in an interval, taken for the truth

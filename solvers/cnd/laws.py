@@ -135,9 +135,9 @@ class LawTraining:
                  own: ca.Function | None, switches: bool = True) -> None:
         self.ocp, self.settings, self.seed, self.own, self.switches = ocp, settings, seed, own, switches
         self.progress = progress
-        substeps = settings.substeps or substeps_for(ocp, None, settings.intervals, FINE)
-        self.ddp = DDP(ocp, intervals=settings.intervals, substeps=substeps)
-        self.loose = DDP(ocp.loosened(TOLERANCE), intervals=4 * settings.intervals, substeps=-(-substeps // 4))
+        substeps = settings.substeps or substeps_for(ocp, None, settings.grid, FINE)
+        self.ddp = DDP(ocp, intervals=settings.grid, substeps=substeps)
+        self.loose = DDP(ocp.loosened(TOLERANCE), intervals=4 * settings.grid, substeps=-(-substeps // 4))
         self.in_torch = InTorch(ocp)
         self.round, self.seconds, self.history = 0, 0.0, list[dict[str, Any]]()
 

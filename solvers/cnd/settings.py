@@ -11,7 +11,7 @@ import torch
 
 from nocl import hjb
 from nocl.definition.ocp import OCP
-from nocl.definition.substeps import INTEGRATORS
+from nocl.definition.substeps import INTEGRATORS, USUAL
 from nocl.nets import ACTIVATIONS, FeatureNet
 from nocl.support import checks
 from nocl.support.fields import Checked, Scaled, choice, coefficients, count, flag, nonnegative, positive, widths
@@ -42,6 +42,11 @@ class TrainSettings(Scaled):
     MOST: ClassVar[int] = 8
     BRANCHES: ClassVar[int] = 2  # with parameters: optima of other kinds are the rule then
 
+    @property
+    def grid(self) -> int:
+        """The intervals, or as many as are usual."""
+        return self.intervals or USUAL
+
     @classmethod
     def of(cls, effort: str, *, parameters: int = 0, **changes: Any) -> TrainSettings:
         """The settings of an effort, "quick", "normal" or "best", with changes of single fields.
@@ -56,7 +61,8 @@ class TrainSettings(Scaled):
             more["branches"] = max(usual["branches"], cls.BRANCHES)
         return cls(**{**usual, **more, **changes})
 
-    intervals: int = count(80, "held controls of each labelled solution")
+    intervals: int | None = count(None, "held controls of each labelled solution", none="80, or two or four times as "
+                                  "many where plans on these cost too much more than the optimum in continuous time")
     substeps: int | None = count(None, "steps in each interval", none="as many as a few solutions ask for, held "
                                  "against the plant on far shorter steps; the card says how many")
     integrator: str = choice(AUTO, "of these steps: Runge-Kutta's, implicit ones (Radau) of the exact f, or, auto, "

@@ -99,9 +99,9 @@ class StationaryTraining(LawTraining):
     def _over(self, T: float) -> None:
         """Solutions take T from now on."""
         s, self.posed = self.settings, ended(self.ocp, T)
-        substeps = s.substeps or substeps_for(self.posed, None, s.intervals, FINE)
-        self.ddp = DDP(self.posed, intervals=s.intervals, substeps=substeps)
-        self.loose = DDP(self.posed, intervals=4 * s.intervals, substeps=-(-substeps // 4))
+        substeps = s.substeps or substeps_for(self.posed, None, s.grid, FINE)
+        self.ddp = DDP(self.posed, intervals=s.grid, substeps=substeps)
+        self.loose = DDP(self.posed, intervals=4 * s.grid, substeps=-(-substeps // 4))
         self.in_torch = InTorch(self.posed)
 
     def _arrival(self, s: Solution) -> tuple[NDArray[np.bool_], Array]:
@@ -167,7 +167,7 @@ class StationaryTraining(LawTraining):
             fresh = Problems.initial(self.ocp, s.held_out, rng)
             best = self.bank.solve(self.loose, fresh.x, fresh.p, 4)
             law = self._finished()
-            J, x, _ = continuous_run(law, self.in_torch, fresh, 4 * s.intervals)
+            J, x, _ = continuous_run(law, self.in_torch, fresh, 4 * s.grid)
             own = self.loose.solve(fresh.x, u=_held(law, x), progress=False)
             best = better(best, pruned(self.loose, own, self.lqr, self.level))
             arrived = self._value(x[:, -1]) < self.level

@@ -35,6 +35,7 @@ from nocl.definition.substeps import FINE, RADAU, RK4, Steps
 from nocl.exports import parity
 from nocl.nets import FeatureNet
 from nocl.solvers.cnd.controller import CND
+from nocl.solvers.cnd.fineness import intervals_for
 from nocl.solvers.cnd.held import Held
 from nocl.solvers.cnd.laws import LawTraining, check_law
 from nocl.solvers.cnd.paper import PaperSettings, train_paper
@@ -152,6 +153,8 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
     if ocp.is_free:
         check_law(ocp, dynamics, chosen)
         return LawTraining(ocp, chosen, seed, progress, own).run()
+    if chosen.intervals is None and not chosen.control_dt:
+        chosen = replace(chosen, intervals=intervals_for(ocp, dynamics, lambda K: _steps(ocp, dynamics, chosen, K)))
     return Training(ocp, dynamics, chosen, seed, out, progress, own, begin).run()
 
 
@@ -187,7 +190,7 @@ def _expect(settings: Any, kind: Any) -> Any:
     return settings or kind()
 
 
-def _steps(ocp: OCP, dynamics: LearnedDynamics | None, s: TrainSettings) -> Steps:
+def _steps(ocp: OCP, dynamics: LearnedDynamics | None, s: TrainSettings, intervals: int) -> Steps:
     """Those of an interval; chosen by a few solutions, explicit ones alone on learned dynamics."""
     if dynamics is not None and s.integrator == RADAU:
         raise ValueError("train: integrator='radau' makes steps of the exact f, and training is on learned dynamics; "
@@ -196,7 +199,7 @@ def _steps(ocp: OCP, dynamics: LearnedDynamics | None, s: TrainSettings) -> Step
     integrator = usual if s.integrator == AUTO else s.integrator
     if s.substeps:
         return Steps(integrator or RK4, s.substeps)
-    return steps_for(ocp, dynamics, s.intervals, FINE, integrator)
+    return steps_for(ocp, dynamics, intervals, FINE, integrator)
 
 
 class Training:
@@ -209,14 +212,14 @@ class Training:
         self.begin = time.monotonic() if begin is None else begin  # what the budget counts from
         self.ocp, self.settings, self.seed = ocp, settings, seed
         self.learned = dynamics is not None
-        self.integrator, self.substeps = _steps(ocp, dynamics, settings)
+        self.integrator, self.substeps = _steps(ocp, dynamics, settings, settings.grid)
         self.in_torch = InTorch(ocp, dynamics, self.integrator)
         self.held = Held(ocp, self.learned) if ocp.is_held else None
         same: dict[str, Any] = {"dynamics": dynamics, "integrator": self.integrator}
-        self.plain = DDP(ocp, intervals=settings.intervals, substeps=self.substeps,
+        self.plain = DDP(ocp, intervals=settings.grid, substeps=self.substeps,
                          constraints="hard" if self.held is None else "elastic", **same)
         finer = self.substeps if self.integrator == RADAU else -(-self.substeps // 4)  # layers are as thin as they were
-        self.fine = DDP(ocp, intervals=4 * settings.intervals, substeps=finer, **same)
+        self.fine = DDP(ocp, intervals=4 * settings.grid, substeps=finer, **same)
         self.solved: list[Solution] = []  # what the labels are of, where constraints have margins that may change
         self._inside(None if self.held is None else self.held.first)
         self.checkpoint = None if out is None else Path(out) / CHECKPOINT
@@ -332,7 +335,7 @@ class Training:
         if not len(best):
             return "no held-out state was solved"
         lost = summary(labels_gap(self.in_torch, labels, best, self.fine.substeps), "labels")["labels_median"]
-        row["floor"] = {"labels_median": lost, "by": floored_by(row, lost, s.intervals, s.gap_median)}
+        row["floor"] = {"labels_median": lost, "by": floored_by(row, lost, s.grid, s.gap_median)}
         return str(row["floor"]["by"])
 
     def _first_labels(self) -> None:
@@ -499,7 +502,7 @@ class Training:
                 row |= self._violations(starts, tails) | {"infeasible": cannot_hold(fresh)}
             if s.control_dt:
                 best = extend(self.plain, self.bank, starts.x[:, 0], p=starts.p)  # without margins
-                held = at_rate(self.net, self.ocp.horizon / s.intervals)
+                held = at_rate(self.net, self.ocp.horizon / s.grid)
                 row |= summary(held_gap(held, self.in_torch, best, self.substeps), "held")
             bar.set_postfix_str(f"gap {100 * row['gap_median']:.3f} %, p95 {100 * row['gap_p95']:.3f} %, "
                                 f"kicked {100 * row['kicked_median']:.3f} %")
