@@ -19,6 +19,7 @@ from nocl.data import Solution
 from nocl.definition.ocp import OCP
 from nocl.definition.scales import usual_sizes
 from nocl.definition.substeps import RK4
+from nocl.judge.runs import Simulation
 from nocl.judge.simulation import simulate
 from nocl.solvers.cnd.settings import TrainSettings
 from nocl.solvers.cnd.training import estimate
@@ -35,10 +36,12 @@ STILL = 1e-6  # of usual sizes, what a state may drift by over the horizon at a 
 RANK = 1e-8  # relative singular values below which a mode is not controlled
 UNSTABLE = 1e-6  # modes times the horizon that grow faster need a control
 STATES, STARTS = 8, 4  # that are solved
-HELD = 4  # that held controls are tried from
+HELD, LOOKS = 4, 32  # that held controls are tried from, and how often they are looked at on the way
 CHECKED = 2  # of them by NMPC, too
 AGREE = 1e-3  # of the cost: methods that differ by more disagree
 SMALL = 1e-3  # of a usual cost: costs are not divided by less
+AHEAD = 1e6  # steps, that what blows up is followed
+FALLEN = 1e3  # usual costs below 0: what costs as little has no least
 NEAR = 0.05  # of the cost: other optima that are so near make a switching surface
 
 
@@ -159,11 +162,18 @@ def _held(ocp: OCP, seed: int) -> Iterator[Finding]:
     x0, p = ocp.initial_states.sample(n, seed), ocp.sample_parameters(n, seed)
     laws = {"u*": ocp.goals(p)[1], "the middle of U": np.tile((s.lbu + s.ubu) / 2, (n, 1)),
             "lbu": np.tile(s.lbu, (n, 1)), "ubu": np.tile(s.ubu, (n, 1))}
-    lost = {}
+    lost, least = {}, 0.0
     for name, u in laws.items():
-        run = simulate(ocp, np.clip(u, s.lbu, s.ubu)[:, None], x0, p=p if ocp.np else None)
+        held = np.clip(u, s.lbu, s.ubu)
+        run = simulate(ocp, np.repeat(held[:, None], LOOKS, axis=1), x0, p=p if ocp.np else None)
         if not run.reached.all():
             lost[name] = int((~run.reached).sum())
+        least = min(least, _least(ocp, run, held, p))
+    if least < -FALLEN:
+        yield Finding("boundedness", PROBLEM, "states run away under controls that are held, and the cost falls "
+                      "without an end while they do: expected one that is bounded below; bound the states "
+                      "(state_bounds, constraints), or let what is gained saturate")
+        return
     if not lost:
         yield Finding("boundedness", OK, "states stay finite over the horizon under controls that are held")
         return
@@ -171,6 +181,18 @@ def _held(ocp: OCP, seed: int) -> Iterator[Finding]:
     yield Finding("boundedness", REMARK, f"states blow up before the horizon under u held at {where}: first guesses "
                   "and untrained controllers do so too; a shorter horizon, narrower bounds of U, or saturation in f "
                   "where the plant has it")
+
+
+def _least(ocp: OCP, run: Simulation, u: Array, p: Array) -> float:
+    """The least cost of runs with controls u [B, nu] held, in usual costs; of those that blow up that of L, over the
+    horizon, where they are heading: their last step before, AHEAD times as long.
+    """
+    lost, of = np.flatnonzero(~run.reached), ocp.functions
+    last = np.isfinite(run.x[lost]).all(axis=2).sum(axis=1) - 1
+    here, before = (run.x[lost, np.maximum(last - back, 0)] for back in (0, 1))
+    x = here + AHEAD * (here - before)
+    L = of.L(*of.arguments.columns(x=x, u=u[lost], t=run.t[last], p=p[lost])).full()
+    return float(np.fmin.reduce(np.r_[run.cost, ocp.longest * L.ravel()], initial=0.0) / usual_sizes(ocp).cost)
 
 
 # Solutions

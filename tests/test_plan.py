@@ -3,6 +3,7 @@
 import importlib
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -180,6 +181,17 @@ def test_labels_followed_as_feedback_lose_by_the_square_of_their_interval():
         lost.append(np.median(labels_gap(InTorch(ocp), labels, best)))
     assert lost[0] > 3 * lost[1] > 9 * abs(lost[2])
     assert abs(lost[2]) < 1e-3
+
+
+def test_plans_whose_open_loop_runs_away_are_refined_as_feedback():
+    """An unstable reactor: of its plans on 80 intervals most, held on 320, end in an explosion, and no descent."""
+    ocp = nocl.load_ocp(Path(__file__).resolve().parents[1] / "examples" / "exothermic_reactor.py")
+    labels = DDP(ocp, intervals=80, substeps=1, threads=1).solve(ocp.initial_states.sample(24, 5), progress=False)
+    labels, fine = labels[labels.success], DDP(ocp, intervals=320, substeps=1, threads=1)
+    found = solved_again(fine, labels)
+    assert (found.success & (found.cost <= labels.cost)).sum() >= len(labels) - 2
+    held = fine.solve(labels.x[:, 0], u=np.repeat(labels.u, 4, axis=1), progress=False)
+    assert held.success.sum() < len(labels) - 4
 
 
 def test_what_floors_the_gap_is_named():

@@ -3,6 +3,7 @@ faster."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -36,7 +37,8 @@ class ValueKernel:
         self.slopes = [i.numpy().astype(np.int64) for i in (rows_of, columns)]
         size = np.empty(1, np.int64)
         self.kernel("nocl_value_work", size, size)
-        self.work = np.empty(-(-int(size[0]) // 8))
+        self.bytes, self.work = int(size[0]), np.empty(0)
+        self.threads = os.cpu_count() or 1
 
     def __call__(self, rows: Tensor) -> Tensor:
         """The loss of these rows [B], a scalar that autograd can go back from."""
@@ -51,9 +53,13 @@ class ValueKernel:
         if len(rows) == 0 or rows.min() < 0 or rows.max() >= len(self.labels):
             raise IndexError(f"the loss of V has {len(self.labels)} labels; got {len(rows)} row numbers"
                              + (f" from {rows.min()} to {rows.max()}" if len(rows) else ""))
-        value, gradient = np.empty(1), np.empty_like(theta)
-        self.kernel("nocl_value_loss", rows, len(rows), theta, self.labels, *self.slopes, self.work, gradient, value)
-        return float(value[0]), gradient
+        blocks = -(-len(rows) // self.kernel.width)  # their sums are the same whatever the number of threads
+        if 8 * len(self.work) < blocks * self.bytes:
+            self.work = np.empty(-(-blocks * self.bytes // 8))
+        value, gradient = np.empty(blocks), np.empty((blocks, len(theta)), theta.dtype)
+        self.kernel("nocl_value_loss", rows, len(rows), theta, self.labels, *self.slopes, self.work, gradient, value,
+                    threads=self.threads)
+        return float(value.sum()), gradient.sum(0)
 
 
 class _WithGradient(torch.autograd.Function):

@@ -94,11 +94,11 @@ class Costs:
 
 
 def iterations(stage: Stage, s: TrainSettings) -> int:
-    """Of a fit: twice as many from the round on that may be the last, and of further fits of V."""
+    """Of a fit: twice as many of the controller's from the round on that may be the last."""
     name, number = stage
     if name == "controller":
         return s.iterations * (2 if number >= max(s.least_rounds, 1) else 1)
-    return s.value_iterations * (2 if number else 1)
+    return s.value_iterations
 
 
 def stages(s: TrainSettings, rounds: int, fits: int) -> Iterator[Stage]:

@@ -87,7 +87,7 @@ class TrainSettings(Scaled):
     value_initial: int = count(1500, "initial states solved for V, from the nearest solutions and the policy's answers")
     value_tails: int = count(6000, "tails solved for V, from the tube")
     value_visits: int = count(3000, "more of them, from states that the policy visits under kicks")
-    value_iterations: int = count(7000, "of the first fit of V; twice as many of further ones")
+    value_iterations: int = count(7000, "of each fit of V")
     value_rounds: int = count(3, "fits of V at most: each further one on as many labels more")
     value_error: float = positive(2.5e-3, "stop once met: mean of |V - J*| / (J* + a tenth of a usual J*) at held-out "
                                   "initial, tube and kicked states")

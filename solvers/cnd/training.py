@@ -153,9 +153,7 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
     if ocp.is_free:
         check_law(ocp, dynamics, chosen)
         return LawTraining(ocp, chosen, seed, progress, own).run()
-    if chosen.intervals is None and not chosen.control_dt:
-        chosen = replace(chosen, intervals=intervals_for(ocp, dynamics, lambda K: _steps(ocp, dynamics, chosen, K)))
-    return Training(ocp, dynamics, chosen, seed, out, progress, own, begin).run()
+    return Training(ocp, dynamics, _gridded(ocp, dynamics, chosen), seed, out, progress, own, begin).run()
 
 
 def estimate(ocp: OCP, settings: TrainSettings, seed: int = 0) -> str:
@@ -166,9 +164,16 @@ def estimate(ocp: OCP, settings: TrainSettings, seed: int = 0) -> str:
     checks.problem(ocp, "an estimate of training")
     ocp.refuse_free("an estimate of training")
     with one_thread(), within(False):
-        run = Training(ocp, None, settings, seed, None, False)
-        costs = measured(ocp, run.ddp, run.fine, run.in_torch, settings)
+        run = Training(ocp, None, _gridded(ocp, None, settings), seed, None, False)
+        costs = measured(ocp, run.ddp, run.fine, run.in_torch, run.settings)
     return str(run.planned(costs))
+
+
+def _gridded(ocp: OCP, dynamics: LearnedDynamics | None, s: TrainSettings) -> TrainSettings:
+    """The settings with as many intervals as plans need, where they do not say; held controls are judged as held."""
+    if s.intervals is not None or s.control_dt:
+        return s
+    return replace(s, intervals=intervals_for(ocp, dynamics, lambda K: _steps(ocp, dynamics, s, K)))
 
 
 def _check(ocp: OCP, dynamics: LearnedDynamics | None, seed: int, out: str | os.PathLike[str] | None) -> None:

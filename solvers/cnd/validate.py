@@ -42,9 +42,17 @@ def refined(fine: DDP, coarse: Solution) -> Solution:
 
 
 def solved_again(fine: DDP, coarse: Solution) -> Solution:
-    """The solutions that succeeded, solved again on the fine grid."""
-    s = coarse[coarse.success]
-    return fine.solve(s.x[:, 0], s.t[:, 0], p=s.p, u=np.repeat(s.u, fine.intervals // s.u.shape[1], axis=1))
+    """The solutions that succeeded, solved again on the fine grid, from them as feedback: open loops may run away."""
+    s, times = coarse[coarse.success], fine.intervals // coarse.u.shape[1]
+    u, gain = (np.repeat(of, times, axis=1) for of in (s.u, s.gain))
+    return fine.solve(s.x[:, 0], s.t[:, 0], p=s.p, u=u, x=_between(s.x, times), gain=gain)
+
+
+def _between(x: Array, times: int) -> Array:
+    """[B, times K + 1, nx], on cubic splines through the nodes x [B, K+1, nx]."""
+    K = x.shape[1] - 1
+    finer: Array = CubicSpline(np.arange(K + 1), x, axis=1)(np.arange(times * K + 1) / times)
+    return finer
 
 
 def held_out(ddp: DDP, fine: DDP, bank: SolutionBank, fresh: Problems) -> Solution:

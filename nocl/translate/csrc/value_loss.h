@@ -159,34 +159,40 @@ static void down(tile *s, const real *w, real *g)
     }
 }
 
-/* bytes[0] = what nocl_value_loss needs as `work`. */
+enum { BLOCK = 256 };  /* rows of a block: a sum of its own, whichever thread takes it */
+
+static int parameters(void) { return offset(LAYERS + 1) + size[LAYERS] * NF; }
+
+/* bytes[0] = what nocl_value_loss needs as `work` for each block. */
 void nocl_value_work(int64_t first_block, int64_t last_block, const int64_t *at, int64_t *bytes)
 {
     (void)first_block, (void)last_block, (void)at;
     *bytes = sizeof(tile) + BYTES;
 }
 
-/* The mean of the loss over rows at[0 .. n - 1] of the labels, and its gradient g, both of all rows, whatever the
-   blocks. */
+/* The sum of the loss over the rows of each block, at[0 .. n - 1] of the labels, and its gradient g, over n. */
 void nocl_value_loss(int64_t first_block, int64_t last_block, const int64_t *at, int64_t n, const real *w,
                      const real *rows, const int64_t *row, const int64_t *column, char *work, real *g, double *loss)
 {
-    (void)first_block, (void)last_block;
+    work += first_block * (sizeof(tile) + BYTES);  /* one tile for all blocks of a thread: it stays in the cache */
     tile *s = (tile *)(work + BYTES - (uintptr_t)work % BYTES);
-    const int parameters = offset(LAYERS + 1) + size[LAYERS] * NF;
-    *loss = 0;
-    memset(g, 0, parameters * sizeof(real));
-    for (int64_t first = 0; first < n; first += T * LANES) {
-        const int64_t left = n - first, next = left - T * LANES;
-        load(s, at + first, left, rows);
-        prefetch(at + first + T * LANES, next < T * LANES ? next : T * LANES, LABELS, rows);
-        up(s, w, 0);
-        slopes(s, w);
-        *loss += errors(s, row, column, left) / n;
-        up(s, w, T);
-        down(s, w, g);
+    for (int64_t block = first_block; block < last_block; ++block) {
+        const int64_t end = (block + 1) * BLOCK < n ? (block + 1) * BLOCK : n;
+        real *own = g + block * parameters();
+        loss[block] = 0;
+        memset(own, 0, parameters() * sizeof(real));
+        for (int64_t first = block * BLOCK; first < end; first += T * LANES) {
+            const int64_t left = end - first, next = left - T * LANES;
+            load(s, at + first, left, rows);
+            prefetch(at + first + T * LANES, next < T * LANES ? next : T * LANES, LABELS, rows);
+            up(s, w, 0);
+            slopes(s, w);
+            loss[block] += errors(s, row, column, left) / n;
+            up(s, w, T);
+            down(s, w, own);
+        }
+        for (int i = 0; i < parameters(); ++i) own[i] /= n;
     }
-    for (int i = 0; i < parameters; ++i) g[i] /= n;
 }
 
-int64_t nocl_width(void) { return LANES; }
+int64_t nocl_width(void) { return BLOCK; }
