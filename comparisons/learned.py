@@ -118,6 +118,19 @@ def model_loss(ocp: OCP, model: LearnedDynamics, *, n: int = STATES, intervals: 
     return Yardstick.of(ocp, n, intervals, seed).loss(model)[0]
 
 
+def held_out_loss(ocp: OCP, model: LearnedDynamics, part: LearnedDynamics, *, n: int = STATES,
+                  intervals: int = INTERVALS, seed: int = 0) -> ModelLoss:
+    """What the optimum of `part`, learned from a part of a log, loses as feedback on `model`, learned from all of it.
+
+    Where the plant is not known this tells what its recordings leave open: where the two differ in what counts, so may
+    the plant. It does not see what both have wrong. Raises ValueError where no initial state is solved on the model.
+    """
+    for name, one in (("model", model), ("part", part)):
+        checks.instance(LearnedDynamics, one, name, "held_out_loss", "as nocl.identify makes it")
+    plant = replace(ocp, system=ocp.system.under(model.to_casadi()))
+    return Yardstick.of(plant, n, intervals, seed).loss(part)[0]
+
+
 def good_enough(ocp: OCP, model: LearnedDynamics, wanted: float, settings: Settings, *, seed: int = 0,
                 intervals: int = INTERVALS, budget: Budget = ENDLESS) -> tuple[LearnedDynamics, ModelLoss]:
     """The model, or one taught again along its own optima while its gap is more than SHARE of the wanted one, and what

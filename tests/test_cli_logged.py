@@ -1,5 +1,7 @@
 """A plant without equations at the command line: its log -> dynamics -> controller; what needs equations says so."""
 
+import re
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -50,7 +52,9 @@ def here(tmp_path, monkeypatch):
 def test_from_a_log_to_a_controller_and_a_refusal(here, capsys):
     """identify -> train on the plant's name and box alone; the controller works on the equations that nobody showed."""
     assert main(["identify", "plant.py", "--data", "log.csv", "--quick", "--out", "run"]) == 0
-    assert "5 pieces of 5 recordings" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "5 pieces of 5 recordings" in out
+    assert re.search(r"dynamics: that of four fifths, on that of all: f_theta loses [\d.e-]+ % of what control", out)
     model = LearnedDynamics.load(here / "run" / "dynamics")
     at = ca.DM([0.4, -0.3]), ca.DM([0.5])
     np.testing.assert_allclose(model.to_casadi()(*at).full().ravel(), [-0.3, -4 * 0.4 + 0.4 * 0.3 + 0.5], atol=0.1)

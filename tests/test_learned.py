@@ -12,7 +12,7 @@ from lq import A, B, riccati
 import nocl
 from nocl.cli import main, run_folder
 from nocl.cli.commands import parser
-from nocl.comparisons.learned import ModelLoss, Yardstick, good_enough, model_loss
+from nocl.comparisons.learned import ModelLoss, Yardstick, good_enough, held_out_loss, model_loss
 from nocl.sysid import Settings
 from nocl.systems import double_integrator
 
@@ -49,6 +49,18 @@ def test_a_wrong_mass_loses_what_riccati_says():
     assert loss.gap > 0.01
     assert "of what control is about (median" in str(loss)
     assert f"gap {100 * loss.gap:.2g} %" in str(loss)
+
+
+def test_a_model_of_some_recordings_loses_on_that_of_all_what_riccati_says():
+    """The plant itself is not known."""
+    of = nocl.load_ocp("double_integrator")
+    s = of.system
+    unknown = nocl.System(s.name, x=s.x, u=s.u, xdot=None, lbu=s.lbu, ubu=s.ubu, lbx=s.lbx, ubx=s.ubx)
+    ocp = replace(of, system=unknown)
+    loss = held_out_loss(ocp, model_of(1.0), model_of(1.5), n=4, intervals=K)
+    yard = Yardstick.of(of, 4, K)
+    assert loss.gaps == pytest.approx(costs(yard.starts.x, 1.5) / costs(yard.starts.x, 1.0) - 1, rel=1e-3)
+    assert abs(held_out_loss(ocp, model_of(1.0), model_of(1.0), n=4, intervals=K).gap) < 1e-6
 
 
 def test_the_right_mass_loses_nothing_and_is_left_alone():

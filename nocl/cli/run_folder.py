@@ -23,7 +23,7 @@ from nocl import __version__
 from nocl.comparisons.disturbances import mass_variants
 from nocl.comparisons.each import Laws, at_each, is_plan
 from nocl.comparisons.judging import Disturbance, Judging
-from nocl.comparisons.learned import good_enough
+from nocl.comparisons.learned import good_enough, held_out_loss
 from nocl.comparisons.methods import Solving, Starts, own_rate, runs_of
 from nocl.comparisons.report.results import count
 from nocl.comparisons.studies import study
@@ -47,6 +47,7 @@ PARTS = ("dynamics", "cnd", "export", "report", "checkpoint")  # folders in a ru
 KEY = "run"  # of a card: what the stage was made from
 COARSE = 0.01  # of a cost: where judge and plan differ by more, the plan's grid is too coarse
 IDENTIFYING = 0.3  # of a run's minutes, at most
+OPEN = 0.01  # of what control is about, that models of parts of a log may lose on each other
 CHECKING = 0.2  # of those left then, for teaching it again
 JUDGED = 64  # plans of `nocl solve` that are run on the exact f
 OF_LOGS = ("data", "known", "control_affine", "hold_controls")  # of that, what dynamics of a log have more
@@ -111,6 +112,7 @@ class RunFolder:
             held = identify(self.ocp.system, data=train, seed=self.seed, settings=settings, parameters=where,
                             **stated)
             say(f"learned from four fifths of the recordings, simulated on the others:\n{held.validate(test)}")
+            self._say_left_open(model, held)
         outside = int(model.outside(fresh_states(self.ocp, 100, self.seed)).sum())
         if outside:
             say(f"{outside} of 100 initial states of the problem lie outside the log: the model guesses there")
@@ -118,6 +120,19 @@ class RunFolder:
         model.save(self.folder / "dynamics")
         say(f"dynamics: {model.card['score']}, {time.perf_counter() - start:.0f} s, in {self.folder / 'dynamics'}")
         return model
+
+    def _say_left_open(self, model: LearnedDynamics, part: LearnedDynamics) -> None:
+        """What the controls hang on the recordings that a model of a part of them has not seen."""
+        if self.ocp.is_free or self.ocp.is_infinite:
+            return
+        try:
+            loss = held_out_loss(self.ocp, model, part, seed=self.seed)
+        except ValueError as error:  # what cannot be solved, training tells with what to do
+            say(f"dynamics: not held against each other: {error}")
+            return
+        more = "" if loss.median <= OPEN else ": record more where the problem goes, or the controller will be one for " \
+            "this model alone"
+        say(f"dynamics: that of four fifths, on that of all: {loss}{more}")
 
     def train(self, exact: bool) -> CND:
         """The controller and value function, in cnd/; on dynamics/ unless exact."""
