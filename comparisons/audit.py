@@ -44,6 +44,7 @@ def audit(report: Report, methods: Mapping[str, Any], model: Any = None) -> tupl
     what it says of the judged runs stands beside.
     """
     report.ocp.refuse_free("audit")
+    report.ocp.system.refuse_discrete("audit")
     from nocl.support.threads import one_thread  # with torch
 
     learned = None if model is None else dynamics_function(report.ocp, model)

@@ -43,7 +43,8 @@ def compare(ocp: OCP, methods: Mapping[str, Any], n: int = 100, x0: ArrayLike | 
     ----------
     p : parameters, [np] for all states, [B, np], or by name (OCP.parameters_of); default: drawn, where states are
     hold : rates of feedback: None, continuous; K, continuous and once more held on K intervals, as the method
-        "NAME (K holds)"; a list of these, [None, 80, 400], each
+        "NAME (K holds)"; a list of these, [None, 80, 400], each. In discrete time None: feedback is asked at every
+        sample
     workers : 1, a number of processes, or "auto": processes where the measured cost of the first parts says that they
         pay; or a Dask scheduler's "tcp://...". Solvers that take `workers` get it too
     out : a folder that gets each part's outcome as soon as it is there: the same call resumes what is there. A plain
@@ -60,11 +61,11 @@ def compare(ocp: OCP, methods: Mapping[str, Any], n: int = 100, x0: ArrayLike | 
 
     Raises ValueError for methods that are none, or are made for another problem.
     """
-    checks.problem(ocp, "compare")
+    checks.problem(ocp, "compare", discrete=True)
     checks.whole(seed, "seed", "compare", most=2**63)
     Pool(workers)  # refuses what is none before anything is solved
     states = starts_of(ocp, n, x0, seed, p)
-    rates, folder = rates_of(hold), None if out is None else Path(out)
+    rates, folder = rates_of(hold, ocp.steps), None if out is None else Path(out)
     most, start = checks.number(tolerance, "tolerance", "compare"), time.perf_counter()
     solving = Solving(workers, folder, progress)
     judged = judged_runs(ocp, methods, states, rates, solving, most)

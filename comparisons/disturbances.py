@@ -78,6 +78,7 @@ def robustness(ocp: OCP, methods: Mapping[str, Any], x0: ArrayLike, variants: Ma
     counts for no method.
     """
     ocp.refuse_free("robustness")
+    ocp.system.refuse_discrete("robustness")
     rows, _ = checks.states(x0, ocp.system.nx, ocp.system.name)
     starts = Starts(rows.copy(), ocp.parameters_of(p, len(rows), "robustness"))
     return _Study(ocp, checked(methods), starts, settings or Disturbances(), workers,

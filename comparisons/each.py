@@ -28,7 +28,7 @@ def at_each(ocp: OCP, make: Make) -> Any:
 
     Raises ValueError for what is no function, and whatever `make` raises at the nominal parameters.
     """
-    checks.problem(ocp, "at_each")
+    checks.problem(ocp, "at_each", discrete=True)
     if not callable(make):
         raise ValueError(f"at_each: make is {checks.shown(make)}; expected a function of a problem without parameters, "
                          "like nocl.solvers.LQR")

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from nocl.comparisons.each import Laws
-from nocl.comparisons.methods import STAGES, MethodRun, Starts, said, substeps_of
+from nocl.comparisons.methods import SAMPLED, MethodRun, Starts, said, stages_of, substeps_of
 from nocl.definition.constraints import TOLERANCE
 from nocl.definition.ocp import OCP
 from nocl.judge.runs import Simulation
@@ -123,22 +123,22 @@ class Judging:
         except Exception as error:  # whatever a user's controller raises becomes a row: the other states go on
             if len(rows) > 1:
                 return joined(self.ocp, [self.judge(run, row[None], delay) for row in rows])
-            return _unknown(failed(self.ocp, [said(error)], self._nodes(run.hold or 80)))
+            return _unknown(failed(self.ocp, [said(error)], self._nodes(run.hold)))
 
     def _at(self, run: MethodRun, laws: Laws, row: int, delay: float) -> Judgement:
         """One state of a law that is made for its p, judged on the problem at that p."""
         try:
             ocp, _, controller = laws.at(self.starts.p[row])
         except Exception as error:  # whatever it raises at this p
-            return _unknown(failed(self.ocp, [said(error)], self._nodes(run.hold or 80)))
+            return _unknown(failed(self.ocp, [said(error)], self._nodes(run.hold)))
         f = self.disturbance.f
         plant = None if f is None else _folded(f, ocp, self.starts.p[row])
         job = replace(self, ocp=ocp, starts=Starts(self.starts.x, np.zeros((len(self.starts), 0))),
                       disturbance=replace(self.disturbance, f=plant))
         return job.judge(replace(run, controller=controller), np.array([row]), delay)
 
-    def _nodes(self, K: int) -> Array:
-        return np.linspace(0.0, self.ocp.longest, K + 1)
+    def _nodes(self, K: int | None) -> Array:
+        return np.linspace(0.0, self.ocp.longest, (K or self.ocp.steps or SAMPLED) + 1)
 
     def _feedback(self, run: MethodRun, rows: Rows, delay: float) -> Judgement:
         starts, controller, d = self.starts[rows], run.controller, self.disturbance
@@ -240,7 +240,7 @@ def _of_loop(loop: Loop) -> tuple[Array, Array, Array]:
     """(ms of the first solve, the median of the later ones, evaluations of f by all), from the loop's last run."""
     ms = 1e3 * np.array([step["seconds"] for step in loop.stats])
     iterations = np.sum([step["iterations"] for step in loop.stats], axis=0)
-    evaluations = iterations * loop.nmpc.intervals * STAGES * substeps_of(loop.nmpc)
+    evaluations = iterations * loop.nmpc.intervals * stages_of(loop.ocp) * substeps_of(loop.nmpc)
     return ms[0], np.median(ms[1:] if len(ms) > 1 else ms, axis=0), evaluations
 
 

@@ -102,8 +102,14 @@ def checked(methods: Mapping[str, Any]) -> Mapping[str, Any]:
     return methods
 
 
-def rates_of(hold: int | Sequence[int | None] | None) -> Rates:
-    """None: continuous. K: continuous, and held on K intervals. A list: these, None standing for continuous."""
+def rates_of(hold: int | Sequence[int | None] | None, steps: int | None = None) -> Rates:
+    """None: continuous. K: continuous, and held on K intervals. A list: these, None standing for continuous.
+
+    steps : of a problem in discrete time, whose feedback has one rate
+    """
+    if steps is not None and hold is not None:
+        raise ValueError(f"hold is {shown(hold)}, and the problem is one in discrete time, with {steps} steps; "
+                         "expected None: feedback is asked at every sample")
     given = (None,) if hold is None else (None, hold) if isinstance(hold, (int, np.integer)) else hold
     if isinstance(given, str) or not isinstance(given, Sequence) or not given or \
             not all(rate is None or is_count(rate) for rate in given):
@@ -190,7 +196,7 @@ def _names(ocp: OCP, name: str, method: Any, rates: Rates) -> list[str]:
         return [name]
     if _policy(ocp, name, method) is not None or _continuous(method):
         return [_held_name(name, rate) for rate in rates]
-    held = _sampled(method, rates)
+    held = _sampled(ocp, method, rates)
     return [name] if len(held) == 1 else [_held_name(name, rate) for rate in held]
 
 
@@ -205,10 +211,11 @@ def _runs(ocp: OCP, name: str, method: Any, x0: Starts, rates: Rates, solving: S
         return [planned(ocp, name, method, parts, len(x0))]
     policy = _policy(ocp, name, method)
     if policy is not None:
-        return [MethodRun(n, how(rate), method, policy, rate) for n, rate in zip(names, rates, strict=True)]
+        return [MethodRun(n, how(rate or ocp.steps), method, policy, rate)
+                for n, rate in zip(names, rates, strict=True)]
     each = ", made anew at each p" if isinstance(method, Laws) else ""
-    return [MethodRun(n, how(rate) + each, method, at_rate(method, rate), rate)
-            for n, rate in zip(names, rates if _continuous(method) else _sampled(method, rates), strict=True)]
+    return [MethodRun(n, how(rate or ocp.steps) + each, method, at_rate(method, rate), rate)
+            for n, rate in zip(names, rates if _continuous(method) else _sampled(ocp, method, rates), strict=True)]
 
 
 def how(hold: int | None, delay: float = 0.0) -> str:
@@ -227,15 +234,18 @@ def at_rate(method: Any, hold: int | None) -> Any:
     return Loop(method.nmpc, hold, method.receding) if isinstance(method, Loop) else method
 
 
-def _sampled(method: Any, rates: Rates) -> list[int]:
-    """Intervals for sampled feedback: as asked for, the method's own (NMPC's loop has a `hold`), or SAMPLED."""
+def _sampled(ocp: OCP, method: Any, rates: Rates) -> list[int]:
+    """Intervals for sampled feedback: as asked for, the method's own (NMPC's loop has a `hold`), or SAMPLED; in
+    discrete time one a step."""
+    if ocp.steps is not None:
+        return [ocp.steps]
     own = getattr(method, "hold", None)
     return [rate for rate in rates if rate is not None] or [int(own) if is_count(own) else SAMPLED]  # type: ignore[arg-type]
 
 
 def own_rate(ocp: OCP, method: Any) -> int | None:
     """Intervals that feedback is held on where no rate is asked for; None: continuous."""
-    return None if policy_function(ocp, method) is not None else _sampled(method, (None,))[0]
+    return None if policy_function(ocp, method) is not None else _sampled(ocp, method, (None,))[0]
 
 
 def _policy(ocp: OCP, name: str, method: Any) -> ca.Function | None:
@@ -327,13 +337,18 @@ def planned(ocp: OCP, name: str, method: Any, parts: Sequence[Solution | str], B
         u[rows], predicted[rows], plan.x[rows] = s.u, s.cost, s.x
         plan.costate[rows], T[rows] = s.costate, s.t[:, -1]
         ms[rows] = 1e3 * s.seconds
-        evaluations[rows] = s.iterations * K * STAGES * substeps_of(method)
+        evaluations[rows] = s.iterations * K * stages_of(ocp) * substeps_of(method)
         solves[rows] = np.maximum(s.starts, 1)
         message += _unsolved(ocp, s)
     u[[bool(m) for m in message]] = np.nan
     solved = Solved(ms, solves, predicted, evaluations, plan, message)
     return MethodRun(name, f"open loop, held on {count(K, 'interval')}", method, u, solved=solved,
                      horizon=T if ocp.is_free else None)
+
+
+def stages_of(ocp: OCP) -> int:
+    """Evaluations of f in a step."""
+    return 1 if ocp.system.is_discrete else STAGES
 
 
 def substeps_of(solver: Any) -> int:

@@ -60,7 +60,7 @@ def _outside(ocp: OCP, starts: Starts, tolerance: float) -> list[str]:
 def _asked(ocp: OCP, starts: Starts, controls: Sequence[Array], ends: Sequence[Array], tolerance: float,
            solving: Solving) -> list[str]:
     """What DDP says of states, by the plan of all that comes nearest to holding the constraints."""
-    ddp, p = DDP(ocp, intervals=INTERVALS, between=False), starts.p if ocp.np else None
+    ddp, p = DDP(ocp, intervals=ocp.steps or INTERVALS, between=False), starts.p if ocp.np else None
 
     def spread(what: str) -> dict[str, Any]:
         out = None if solving.out is None else solving.out / "possible" / what
@@ -68,7 +68,7 @@ def _asked(ocp: OCP, starts: Starts, controls: Sequence[Array], ends: Sequence[A
 
     plans = [solve_globally(ddp, starts.x, starts=STARTS, rounds=1, seed=0, **spread("cold"))]
     for number, (u, T) in enumerate(zip(controls, ends, strict=True)):
-        guess = held_guess(ocp, u, T, INTERVALS, p)
+        guess = held_guess(ocp, u, T, ddp.intervals, p)
         plans.append(ddp.solve(starts.x, **guess, **spread(f"from-{number}")))
     found = np.any([plan.success for plan in plans], axis=0)
     shares = np.array([_worst(ocp, plan) for plan in plans])  # [plans, B, K + 1, rows]

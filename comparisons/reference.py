@@ -22,7 +22,8 @@ SLOTS = 40  # kicks fall on multiples of the horizon over SLOTS
 
 
 class Reference:
-    """The best of DDP's descents on `intervals` held controls, from each of `guesses` and from u*.
+    """The best of DDP's descents on `intervals` held controls, or the steps of a system in discrete time, from each of
+    `guesses` and from u*.
 
     A method's gap to the best known cost says little where that method found it: with this row beside it, no method is
     measured against itself alone. Constraints hold, at the nodes and between them; a state from which no plan was found
@@ -41,11 +42,11 @@ class Reference:
     def __init__(self, ocp: OCP, intervals: int, guesses: Sequence[Array] = (), ends: Sequence[Array] = (),
                  tolerance: float = TOLERANCE) -> None:
         self.ocp = ocp.loosened(INSIDE * tolerance) if ocp.is_free and tolerance > EXACT else ocp
-        self.intervals, self.guesses, self.ends = intervals, list(guesses), list(ends)
+        self.intervals, self.guesses, self.ends = ocp.steps or intervals, list(guesses), list(ends)
 
     def solve(self, x0: Array, p: Array | None = None) -> Solution:
         """The best solution of each state x0 [B, nx], p [B, np]; guesses are of the same."""
-        ddp = DDP(self.ocp, intervals=self.intervals, between=True)
+        ddp = DDP(self.ocp, intervals=self.intervals, between=not self.ocp.system.is_discrete)
         best = ddp.solve(x0, p=p)
         for u, T in zip_longest(self.guesses, self.ends):
             best = better(best, ddp.solve(x0, p=p, **held_guess(self.ocp, u, T, self.intervals, p)))

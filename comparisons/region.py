@@ -37,6 +37,7 @@ def region(ocp: OCP, name: str, method: Any, scales: Sequence[float] = SCALES, n
     out. Farther out there may be states from which no plan holds the constraints: nobody succeeds there.
     """
     ocp.refuse_free("region")
+    ocp.system.refuse_discrete("region")
     if not scales or min(scales) <= 0 or list(scales) != sorted(set(scales)):
         raise ValueError(f"scales is {scales!r}; expected rising numbers > 0, like (0.5, 1, 2)")
     states, good, p = list[Array](), list[Array](), ocp.sample_parameters(n, own_numbers(seed, 0, 1))

@@ -46,6 +46,7 @@ def stability(report: Report, methods: Mapping[str, Any]) -> tuple[Stability, ..
     """
     ocp = report.ocp
     ocp.refuse_free("stability")
+    ocp.system.refuse_discrete("stability")
     laws = {name: law for name, method in methods.items() if (law := _law(ocp, method)) is not None}
     if "LQR" not in methods:
         laws |= _lqr(ocp)

@@ -45,18 +45,19 @@ def study(ocp: OCP, methods: Mapping[str, Any], n: int = 200, x0: ArrayLike | No
     variants, disturbances : of robustness
 
     The reference is DDP's on FINE intervals, from what each method found; it holds the constraints, and is judged like
-    the others. Where the horizon is free there are no audits, stability and disturbances. With `out`
-    solves and judged runs are kept; the reference, audits, optima under disturbances and regions are found anew.
+    the others. Where the horizon is free, and in discrete time, there are no audits, stability and disturbances. With
+    `out` solves and judged runs are kept; the reference, audits, optima under disturbances and regions are found anew.
     """
-    checks.problem(ocp, "study")
+    checks.problem(ocp, "study", discrete=True)
     if robust:
         ocp.refuse_free("study(robust=True)")
+        ocp.system.refuse_discrete("study(robust=True)")
     folder = None if out is None else Path(out)
     report = compare(ocp, methods, n, x0, seed, hold, workers, None if folder is None else folder / "compare", progress,
                      p, tolerance)
     report = with_reference(report, FINE, workers, progress)
     report = replace(report, promises=promises(report))
-    if ocp.is_free:
+    if ocp.is_free or ocp.system.is_discrete:
         return report
     report = replace(report, audits=audit(report, methods, model), stability=stability(report, methods))
     if not robust:

@@ -246,7 +246,8 @@ class Solution:
         """
         times = checks.numeric(t, "t", "Solution", "a time or a list of times")
         if self.dense is None:
-            raise ValueError("this Solution has no `dense`, which solution(t) interpolates: NMPC.solve gives it")
+            raise ValueError("this Solution has no `dense`, which solution(t) interpolates: NMPC.solve gives it, "
+                             "in continuous time")
         first, last = self.t[:, 0].max(), self.t[:, -1].min()
         if times.ndim > 1 or not ((times >= first) & (times <= last)).all():
             raise ValueError(f"t is {checks.shown(t)}; expected a time or a list of times in [{first:g}, {last:g}]")

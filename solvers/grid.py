@@ -31,12 +31,13 @@ Stages = dict[str, Array]  # x [n, nx], u [n, nu], t [n], p [n, np]
 
 def measured(ocp: OCP, functions: Functions, solution: Solution, substeps: int, integrator: str = RK4,
              soft: bool = False) -> Grid | None:
-    """The grid of some solutions of an OCP under f, by the first ROWS that were solved; None where none was.
+    """The grid of some solutions of an OCP under f, by the first ROWS that were solved; None where none was, and in
+    discrete time, where plan and plant have the same steps.
 
     soft : whether their costs have the penalty of soft constraints; its kinks are no error of plans that hold them
     """
     solution = solution[np.flatnonzero(solution.success)[:ROWS]]
-    if not len(solution):
+    if not len(solution) or ocp.system.is_discrete:
         return None
     step, errors = float(np.diff(solution.t, axis=1).max()), _errors(ocp, functions, solution, integrator, soft)
     return grid_of(step, substeps, lambda n: float(errors(n).max()), fastest(functions, _stages(solution)),

@@ -3,7 +3,8 @@
 With d = x - x*, from the nearest image of the goal where the problem is periodic in an angle, it is
 V = d' P d / 2 + const and u = u* - K d. With the Hessians Q, R, S of L and the Jacobians A, B of f at (x*, u*),
 K = R^-1 (B' P + S') and -dP/dt = Q + A' P + P A - K' R K, P(T) = the Hessian of G (Anderson, Moore (1990), "Optimal
-Control: Linear Quadratic Methods", ch. 2-3); on an infinite horizon dP/dt = 0. K has the field's sign, u* - K d, where
+Control: Linear Quadratic Methods", ch. 2-3); on an infinite horizon dP/dt = 0. In discrete time P goes from sample to
+sample (solvers/riccati.py). K has the field's sign, u* - K d, where
 a Solution's gain is u_k + gain (x - x_k).
 """
 
@@ -21,8 +22,10 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import BSpline, make_interp_spline
 from scipy.linalg import LinAlgError, solve_continuous_are
 
+from nocl.definition.discrete import WHOLE
 from nocl.definition.ocp import OCP
 from nocl.definition.scales import units
+from nocl.solvers.riccati import Stages
 from nocl.support import checks
 from nocl.support.checks import Array
 
@@ -43,14 +46,21 @@ class _LinearQuadratic:
     S: Array
     P_final: Array
     unit: Array  # [nx, nx]
+    dt: float | None = None  # in discrete time
 
     def gain(self, P: Array) -> Array:
         return np.asarray(np.linalg.solve(self.R, self.B.T @ P + self.S.T))
 
+    @property
+    def stages(self) -> Stages:
+        """Those of a system in discrete time: a step changes, and costs, dt times what a unit of time does."""
+        dt = self.dt or 0.0
+        return Stages(np.eye(len(self.A)) + dt * self.A, dt * self.B, dt * self.Q, dt * self.R, dt * self.S)
+
 
 class LQR:
     """u(x, t) = clip(u* - K(t) (x - x*), U) on a finite horizon, or with constant K where it is `infinite`, as
-    nocl.INFINITE is.
+    nocl.INFINITE is. Of a system in discrete time K is that of the sample at t, or before it.
 
     Of one problem: with parameters, that at given ones, LQR(ocp.at(p=...)).
 
@@ -60,16 +70,16 @@ class LQR:
     """
 
     def __init__(self, ocp: OCP, infinite: bool = False) -> None:
-        checks.problem(ocp, "LQR", infinite=True)
+        checks.problem(ocp, "LQR", infinite=True, discrete=True)
         infinite = checks.flag(infinite, "infinite", "LQR") or ocp.is_infinite
         ocp.refuse_parameters("LQR")
-        (ocp.lasting(1.0) if ocp.is_infinite else ocp).refuse_constraints("LQR")
+        (ocp.lasting(ocp.system.dt or 1.0) if ocp.is_infinite else ocp).refuse_constraints("LQR")
         ocp.refuse_without_goal("LQR")
         self.ocp, self.infinite = ocp, infinite
         self.A, self.B = (j.full() for j in ocp.functions.jacobian(ocp.x_goal, ocp.u_goal))
         self.Q, self.R, self.S, self.P_final = _hessians(ocp)
         _check_equilibrium(ocp)
-        if np.linalg.eigvalsh(self.R).min() <= 0:
+        if not ocp.system.is_discrete and np.linalg.eigvalsh(self.R).min() <= 0:
             raise ValueError(f"LQR of {ocp.system.name!r}: the Hessian of L in u has the eigenvalues "
                              f"{np.linalg.eigvalsh(self.R).tolist()}; expected > 0: add a cost on each control")
         self._L_goal, self._G_goal = float(ocp.L(ocp.x_goal, ocp.u_goal)), float(ocp.G(ocp.x_goal))
@@ -102,24 +112,45 @@ class LQR:
         spline = make_interp_spline(t, path.sol(T - t).T, k=DEGREE)
         return BSpline(spline.t, spline.c * of.unit.ravel(), DEGREE)
 
+    @cached_property
+    def _samples(self) -> Array:
+        """P [K+1, nx, nx] at the samples of a system in discrete time."""
+        steps, of = self.ocp.steps, self._scaled
+        assert steps is not None
+        P = of.stages.backward(of.P_final, steps)
+        lost = np.flatnonzero(~np.isfinite(P).all(axis=(1, 2)))
+        if lost.size:
+            raise ValueError(f"LQR of {self.ocp.system.name!r}: at step {lost[-1]} of {steps} no control is best; "
+                             "expected dt L and what follows to be convex in u: add a cost on each control")
+        return np.asarray(P * of.unit)
+
     def _solve_infinite(self) -> Array:
         of = self._scaled
+        if of.dt is not None:
+            found = of.stages.for_ever()
+            if found is None:
+                raise ValueError(self._no_gain())
+            return np.asarray(found * of.unit)
         try:
             P = solve_continuous_are(of.A, of.B, of.Q, of.R, s=of.S)
             stable = np.isfinite(P).all() and np.linalg.eigvals(of.A - of.B @ of.gain(P)).real.max() < 0
         except LinAlgError:
             stable = False
         if not stable:
-            raise ValueError(f"LQR of {self.ocp.system.name!r}: no stabilising gain on an infinite horizon"
-                             f"{self._lasting_modes()}; expected (A, B) stabilisable at the goal and every slow mode "
-                             "in L: use a finite horizon, or a cost on the states in L")
+            raise ValueError(self._no_gain())
         return np.asarray(P * of.unit)
+
+    def _no_gain(self) -> str:
+        return (f"LQR of {self.ocp.system.name!r}: no stabilising gain on an infinite horizon{self._lasting_modes()}; "
+                "expected (A, B) stabilisable at the goal and every slow mode in L: use a finite horizon, or a cost on "
+                "the states in L")
 
     def _lasting_modes(self) -> str:
         """The states that stay as they are, in words: of the modes of A that do not decay and that L does not see."""
         rates, ways = np.linalg.eig(self._scaled.A)
+        decay = -STILL if self.ocp.system.dt is None else -STILL / self.ocp.system.dt
         unseen = [way for rate, way in zip(rates, ways.T, strict=True)
-                  if rate.real > -STILL and np.abs(self._scaled.Q @ way).max() < STILL * max(np.abs(way).max(), STILL)]
+                  if rate.real > decay and np.abs(self._scaled.Q @ way).max() < STILL * max(np.abs(way).max(), STILL)]
         names = [name for i, name in enumerate(self.ocp.system.state_names)
                  if any(abs(way[i]) > 0.3 * np.abs(way).max() for way in unseen)]
         return f", since nothing is lost where {', '.join(names)} stays as it is" if names else ""
@@ -131,9 +162,10 @@ class LQR:
         x, u, c = of.x, of.u, of.cost
         return _LinearQuadratic(self.A / x[:, None] * x, self.B / x[:, None] * u, self.Q * x[:, None] * x / c,
                                 self.R * u[:, None] * u / c, self.S * x[:, None] * u / c,
-                                self.P_final * x[:, None] * x / c, c / (x[:, None] * x))
+                                self.P_final * x[:, None] * x / c, c / (x[:, None] * x), self.ocp.system.dt)
 
     def _gain(self, P: Array) -> Array:
+        """K in continuous time."""
         return np.asarray(np.linalg.solve(self.R, self.B.T @ P + self.S.T), dtype=np.float64)
 
     def _time(self, t: Any) -> float:
@@ -144,13 +176,29 @@ class LQR:
         """The Hessian of V at time t, [nx, nx]."""
         if self.infinite:
             return self._P_infinite
+        if self.ocp.system.is_discrete:
+            return np.asarray(self._samples[self._sample(t, len(self._samples) - 1)])
         n = len(self.A)
         P = self._spline(min(max(self._time(t), 0.0), self.ocp.horizon)).reshape(n, n)
         return (P + P.T) / 2
 
     def K(self, t: float = 0.0) -> Array:
         """The gain at time t, [nu, nx], with its field's sign: u = u* - K (x - x*), where a Solution's `gain` is -K."""
-        return self._gain(self.P(t))
+        if not self.ocp.system.is_discrete:
+            return self._gain(self.P(t))
+        return np.asarray(self._gains[self._sample(t, len(self._gains) - 1)])
+
+    def _sample(self, t: Any, last: int) -> int:
+        """The number of the sample at a time, or before it, from 0 to `last`."""
+        k = self._time(t) / (self.ocp.system.dt or 1.0)
+        return int(np.clip(np.floor(k + WHOLE), 0, last))
+
+    @cached_property
+    def _gains(self) -> Array:
+        """K [K, nu, nx] of the steps of a system in discrete time; one that is the same for ever."""
+        of = _LinearQuadratic(self.A, self.B, self.Q, self.R, self.S, self.P_final, np.ones(1), self.ocp.system.dt)
+        after = self._P_infinite[None] if self.infinite else self._samples[1:]
+        return np.array([of.stages.gain(P) for P in after])
 
     def __call__(self, x: ArrayLike, t: float = 0.0) -> Array:
         """u [nu] or [B, nu], clipped to U."""
@@ -174,6 +222,9 @@ class LQR:
         """policy:(x, t) -> u, the same controller in MX."""
         s, n = self.ocp.system, len(self.A)
         at = self.ocp.functions.feedback(ca.MX)
+        if self.ocp.system.is_discrete:
+            u = self.ocp.u_goal - ca.mtimes(self._gain_at(at["t"]), self.ocp.from_goal(at["x"]))
+            return at.function("policy", {"u": ca.fmin(ca.fmax(u, s.lbu), s.ubu)})
         P: Any = ca.DM(self.P(0.0))
         if not self.infinite:
             spline = self._spline
@@ -184,6 +235,18 @@ class LQR:
         K = ca.mtimes(ca.DM(np.linalg.inv(self.R)), ca.mtimes(self.B.T, P) + self.S.T)
         u = self.ocp.u_goal - ca.mtimes(K, self.ocp.from_goal(at["x"]))
         return at.function("policy", {"u": ca.fmin(ca.fmax(u, s.lbu), s.ubu)})
+
+
+    def _gain_at(self, t: ca.MX) -> Any:
+        """K at a time, of a system in discrete time: between samples on a straight line, so that a sample's is exact
+        whatever rounding does to its time."""
+        K, s = self._gains, self.ocp.system
+        if len(K) == 1:
+            return ca.DM(K[0])
+        k = ca.fmin(ca.fmax(t / (s.dt or 1.0), 0.0), len(K) - 1)
+        knots = [0.0, *range(len(K)), len(K) - 1.0]
+        entries = ca.bspline(k, K.ravel().tolist(), [list(map(float, knots))], [1], s.nu * s.nx, {})
+        return ca.reshape(entries, s.nx, s.nu).T
 
 
 def ended(ocp: OCP, T: float) -> OCP:

@@ -18,7 +18,7 @@ from nocl.definition.ocp import OCP
 class Options:
     """Options of a method; it gets those that its entry names in `takes`."""
 
-    intervals: int = 80  # of a plan's held controls
+    intervals: int | None = None  # of a plan's held controls; None: as many as the method has by itself
     seed: int = 0  # of what is random in the method
     substeps: int | None = None  # steps in each interval; None: chosen by what is solved first
     integrator: str | None = None  # of these steps; None: chosen with them

@@ -302,8 +302,8 @@ COLUMNS: tuple[tuple[str, str, str], ...] = (
     ("ms", "ms_per_solve", "number"),
     ("solves", "solves", "number"))
 NOTE = (
-    "Judged on the exact f under CVODES. Gap: to the best known cost of the same initial state, over all methods here "
-    "and simple baselines.",
+    "Judged on the exact f under CVODES, in discrete time by its own steps. Gap: to the best known cost of the same "
+    "initial state, over all methods here and simple baselines.",
     "ms: one evaluation of a controller, or one solve; a solver that tried several starts took so many solves a state.",
     "Mean costs, error and |u| are over the runs that did not fail; predicted is what the method itself expected.",
     "Terminal error: the largest distance of a state from the goal, in per cent of half the width of that state's box.")

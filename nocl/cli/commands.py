@@ -225,6 +225,7 @@ def _check_learnable(ocp: OCP, integrator: str | None = None) -> None:
     if integrator == RADAU:
         raise ValueError("--integrator radau makes steps of the exact f, and training is to be on learned dynamics; "
                          "expected both: add --exact, or leave it out")
+    ocp.system.refuse_discrete("learning the dynamics", "to train on the equations: --exact")
     if ocp.system.uses_time:
         raise ValueError("learned dynamics are not implemented for the time t, which the system "
                          f"{ocp.system.name!r} holds; expected one without: train on the equations, --exact")
@@ -239,11 +240,11 @@ def _run(args: argparse.Namespace) -> None:
         _check_learnable(ocp, args.integrator)
     stages = RunFolder(ocp, out, args.seed, args.effort, args.minutes, args.intervals, args.integrator)
     stages.check(exact=args.exact)
-    _refuse(ocp, args.methods, registry.Options(args.intervals or USUAL, args.seed))
+    _refuse(ocp, args.methods, registry.Options(args.intervals, args.seed))
     with alone(out):
         cnd = stages.train(exact=args.exact)
         failed = _told(lambda: stages.export(cnd, out / "export", ("casadi", "c"), QUICK_PROOF))
-        stages.compare(cnd, out / "report", args.methods, args.n, args.intervals or USUAL)
+        stages.compare(cnd, out / "report", args.methods, args.n, args.intervals)
     if failed:
         raise failed
 
@@ -299,7 +300,7 @@ def _solve(args: argparse.Namespace) -> None:
         raise ValueError(f"nocl solve: --solver {args.solver} makes no plans on a grid and takes no --{ignored[0]}: "
                          "leave it out")
     with alone(out / "solutions"):
-        options = registry.Options(args.intervals or USUAL, args.seed, args.substeps, args.integrator)
+        options = registry.Options(args.intervals, args.seed, args.substeps, args.integrator)
         solve(ocp, out / "solutions", args.solver, args.n, options, args.workers, args.p)
 
 
@@ -322,9 +323,9 @@ def _compare(args: argparse.Namespace) -> None:
     out = args.out if args.out is not None else run / "report"
     arguments.check_out(out)
     seed = int(cnd.card.get("seed", 0)) if args.seed is None else args.seed
-    _refuse(cnd.ocp, args.methods, registry.Options(args.intervals or USUAL, seed))
+    _refuse(cnd.ocp, args.methods, registry.Options(args.intervals, seed))
     with alone(beside(out, run)):  # where outcomes so far are kept
-        RunFolder(cnd.ocp, run, seed).compare(cnd, out, args.methods, args.n, args.intervals or USUAL, args.hold,
+        RunFolder(cnd.ocp, run, seed).compare(cnd, out, args.methods, args.n, args.intervals, args.hold,
                                               args.robust)
 
 

@@ -192,7 +192,7 @@ class RunFolder:
                              strict=strict)
         say(f"export: {certificate}, {time.perf_counter() - start:.1f} s")
 
-    def compare(self, cnd: CND, out: Path, methods: Sequence[str], n: int, intervals: int,
+    def compare(self, cnd: CND, out: Path, methods: Sequence[str], n: int, intervals: int | None,
                 hold: Sequence[int | None] | None = None, robust: bool = False) -> None:
         """Study the methods on n fresh initial states, save the report and print its summary and verdict."""
         at = cnd.card.get("p")  # those that it was folded at

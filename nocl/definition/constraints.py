@@ -42,7 +42,8 @@ Measure = Callable[[], tuple[Array, Array]]  # the scales of the rows along a tr
 def limit_rates(system: System, rates: Mapping[str, float]) -> System:
     """The system with each named control u as a state, behind the others, and its rate as the control: |du/dt| <= rate.
 
-    u keeps its symbol, so that costs are written as before, and moves in straight lines where its rate is held. Its
+    u keeps its symbol, so that costs are written as before, and moves in straight lines where its rate is held, in
+    discrete time by dt times its rate in a step. Its
     bounds are a constraint of states now: nocl.OCP(..., state_bounds={"u": (low, high)}). Initial states and goals have
     it as a coordinate. Raises ValueError for names of no control, and for rates that are no positive numbers.
     """
@@ -58,9 +59,14 @@ def limit_rates(system: System, rates: Mapping[str, float]) -> System:
     fresh = {name: (ca.SX.sym(f"{name}_rate"), -most[name], most[name]) if name in most else part
              for name, part in parts.items()}
     u, lbu, ubu = zip(*fresh.values(), strict=True)
-    at = system.arguments
-    return System(f"{system.name}_rates", x=ca.vertcat(at["x"], *(part[0] for part in slow)), u=ca.vertcat(*u),
-                  xdot=ca.vertcat(at.call(system.f), *(fresh[name][0] for name in most)), lbu=lbu, ubu=ubu,
+    at, x = system.arguments, ca.vertcat(system.arguments["x"], *(part[0] for part in slow))
+    rate = ca.vertcat(*(fresh[name][0] for name in most))
+    if system.dt is None:
+        right: dict[str, Any] = {"xdot": ca.vertcat(at.call(system.f), rate)}
+    else:
+        moved = x[system.nx:, :] + system.dt * rate
+        right = {"xdot": None, "x_next": ca.vertcat(at.call(system.F), moved), "dt": system.dt}
+    return System(f"{system.name}_rates", x=x, u=ca.vertcat(*u), **right, lbu=lbu, ubu=ubu,
                   lbx=np.r_[system.lbx, [part[1] for part in slow]], ubx=np.r_[system.ubx, [part[2] for part in slow]],
                   p=at.symbols.get("p"), z=system.z, alg=system.alg, z_guess=system.z_guess,
                   angles=system.angles, units=dict(system.units))

@@ -37,7 +37,7 @@ from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.translate import radau
 from nocl.translate.arguments import Arguments
-from nocl.translate.rk4 import rk4_cost
+from nocl.translate.rk4 import map_cost, rk4_cost
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,7 @@ class Functions:
 
     def stage_of(self, integrator: str) -> Stage:
         """The stage that steps of a kind are expressions in: implicit ones call a root finder, which SX cannot."""
-        return self.stage if integrator == RK4 else self.stage_in_MX
+        return self.stage_in_MX if integrator == RADAU else self.stage
 
     @cached_property
     def scales(self) -> Array:
@@ -247,6 +247,13 @@ class Functions:
         end, cost = at.interval(h, soft=soft, substeps=substeps, integrator=integrator)
         return at.function("step", {"end": end, "cost": cost}, h=h)
 
+    @cached_property
+    def sample(self) -> ca.Function:
+        """(x, u[, t][, p]) -> (x+, dt L) of a step of a system in discrete time, F as it was written."""
+        F = self.system.F  # refuses those in continuous time
+        after = F(*self.stage.of_system)
+        return self.arguments.function("sample", {"x_next": after, "cost": (self.system.dt or 0.0) * self.running})
+
     def collocated(self, *, soft: bool = True, substeps: int = 1) -> ca.Function:
         """(x, u[, t][, p], h, z [substeps s nx]) -> (end, cost, residual [substeps s nx]) of an interval by Radau steps
         with stages z: the true ones where the residual is 0.
@@ -326,9 +333,12 @@ class Stage(Arguments):
 
     def interval(self, h: Any, *, soft: bool = True, substeps: int = 1, integrator: str = RK4) -> tuple[Any, Any]:
         """(x after a time h with u held, the integral of L or L_soft over it), by RK4 steps, whose stages are at t,
-        t + h / 2 and t + h, or by Radau's (nocl/translate/radau.py), for which this is a stage in MX.
+        t + h / 2 and t + h, or by Radau's (nocl/translate/radau.py), for which this is a stage in MX. Of a
+        discrete-time system it is the step of its own, with h L for its cost.
         """
         L, t = self.moments("L_soft" if soft else "L"), self.symbols.get(TIME)
+        if self.functions.system.is_discrete:
+            return map_cost(self.moments("f"), L, self.x, self.u, h, t)
         if integrator == RADAU:
             return radau.radau_cost(self.radau_stages(h / substeps), L, self.x, self.u, h, substeps, t)
         return rk4_cost(self.moments("f"), L, self.x, self.u, h, substeps, t)

@@ -42,13 +42,17 @@ def least_held(ocp: OCP, x: Array, u: Array, t: Array, p: Array) -> Array:
 
 
 def _least_of_u(ocp: OCP, x: Array, u: Array, t: Array, p: Array) -> Array:
-    """Those of the rows that hold the control; x and u [B, n, nu] are of the same times, the first ones of t."""
+    """Those of the rows that hold the control; x and u [B, n, nu] are of the same times, the first ones of t. In
+    discrete time no control acts at the end, nor behind it.
+    """
     of, rows = ocp.functions, ocp.functions.rows[ocp.functions.rows.n_x:]
     if not len(rows) or not x.shape[1]:
         return np.full((len(x), len(rows)), np.inf)
     given = _flat(x, np.asarray(t)[..., :x.shape[1]], p)
-    c = of.c_of_u(*of.arguments.columns(**given, u=u.reshape(-1, ocp.system.nu))).full()
-    return _least(rows.signed(c), *x.shape[:2])
+    c = rows.signed(of.c_of_u(*of.arguments.columns(**given, u=u.reshape(-1, ocp.system.nu))).full())
+    if ocp.system.dt is not None:
+        c = np.where(given["t"] > ocp.horizon - ocp.system.dt / 2, np.inf, c)
+    return _least(c, *x.shape[:2])
 
 
 def least_at_end(ocp: OCP, x: Array, p: Array) -> Array:

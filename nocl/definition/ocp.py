@@ -12,8 +12,8 @@ import casadi as ca
 import numpy as np
 
 from nocl.definition import constraints as limits
+from nocl.definition import discrete, pretty, sampling
 from nocl.definition import parameters as known
-from nocl.definition import pretty, sampling
 from nocl.definition.constraints import (
     ALONG,
     BOUND,
@@ -57,12 +57,16 @@ class OCP:
     f, L and h may hold the time t = nocl.time() and parameters p, G parameters: f(x, u, t, p), L(x, u, t, p), G(x, p),
     h(x, t, p). The order of p is the system's parameters, then the problem's own.
 
+    On a system in discrete time (System.discrete) it is min_u of the sum of dt L(x_k, u_k, k dt, p) over the steps,
+    plus G(x_K, p), with K = horizon / dt: a step costs dt L, and constraints hold at the samples.
+
     Parameters
     ----------
     system : System
     horizon : float, nocl.Free or nocl.INFINITE
         T, in the system's unit of time (seconds for those that come with nocl); nocl.Free(low, high): T is to be found;
         nocl.INFINITE: there is none, the goal pair is an equilibrium that costs nothing, and there is no G.
+        In discrete time a whole number of dt, or nocl.INFINITE.
     running, terminal : casadi.SX
         L(x, u) and G(x), scalars in the system's own symbols; t in G is the horizon.
     x_goal, u_goal : [nx], [nu]
@@ -124,6 +128,8 @@ class OCP:
         for name in ("horizon", "penalty", "penalty_margin"):
             if not isinstance(getattr(self, name), (Free, Infinite)):
                 self._set(**{name: checks.number(getattr(self, name), name, owner, positive=name == "horizon")})
+        if s.is_discrete:
+            self._check_steps(owner)
         self._set(p=known.column(self.p, owner))
         check_unique((*s.names, *self.parameter_names), False, owner)
         if s.z.numel():
@@ -152,6 +158,22 @@ class OCP:
     def _set(self, **values: object) -> None:
         for key, value in values.items():
             object.__setattr__(self, key, value)
+
+    def _check_steps(self, owner: str) -> None:
+        """ValueError for a horizon that is no whole number of steps of a system in discrete time."""
+        if self.is_free:
+            raise ValueError(f"{owner}: horizon is {self.horizon!r}, and {self.system.name!r} is a system in discrete "
+                             f"time; expected a whole number of steps of dt = {self.system.dt:g}: take a long one, "
+                             "where to wait at the goal costs nothing")
+        if not self.is_infinite:
+            discrete.steps_in(self.system, self.horizon, "horizon", owner)
+
+    @property
+    def steps(self) -> int | None:
+        """K, the number of steps until the end, of a system in discrete time; None in continuous time, or for ever."""
+        if not self.system.is_discrete or self.is_infinite:
+            return None
+        return discrete.steps_in(self.system, self.horizon, "horizon", f"OCP on {self.system.name!r}")
 
     def _solve_z(self, s: System) -> System:
         """The system, with its algebraic variables solved for all over the problem; its expressions without them."""
@@ -564,7 +586,7 @@ class OCP:
 
     def refuse_free(self, owner: str) -> None:
         """ValueError for a free or an infinite horizon."""
-        checks.problem(self, owner)
+        checks.problem(self, owner, discrete=True)
         if self.is_free:
             raise ValueError(f"{owner} takes a number as horizon, but that of the problem on {self.system.name!r} is "
                              f"{self.horizon!r}: solve it by NMPC or DDP, or give it one, dataclasses.replace(ocp, "

@@ -200,9 +200,11 @@ def split_controls(system: System, names: Sequence[str]) -> System:
     units = {n: unit for n, unit in system.units.items() if n not in names}
     units |= {f"{n}_{side}": system.units[n] for n, side in itertools.product(names, ("plus", "minus"))
               if n in system.units}
-    xdot = at.given(u=ca.vertcat(*value)).call(system.f)
+    given = at.given(u=ca.vertcat(*value))
+    right: dict[str, Any] = {"xdot": given.call(system.f)} if system.dt is None else \
+        {"xdot": None, "x_next": given.call(system.F), "dt": system.dt}
     alg, guess = (e if e is None else ca.substitute(e, at["u"], ca.vertcat(*value))
                   for e in (system.alg, system.z_guess))
-    return System(f"{system.name}_split", x=at["x"], u=ca.vertcat(*parts), xdot=xdot, lbu=lb, ubu=ub, lbx=system.lbx,
+    return System(f"{system.name}_split", x=at["x"], u=ca.vertcat(*parts), **right, lbu=lb, ubu=ub, lbx=system.lbx,
                   ubx=system.ubx, p=at.symbols.get("p"), z=system.z, alg=alg, z_guess=guess, angles=system.angles,
                   units=units)

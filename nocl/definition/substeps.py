@@ -17,6 +17,7 @@ from nocl.translate import radau
 
 USUAL = 80  # intervals, where nobody says
 RK4, RADAU = "rk4", "radau"
+MAP = "map"  # the step of a discrete-time system: its own
 INTEGRATORS = (RK4, RADAU)
 FINEST = 128  # steps in an interval, taken for the truth
 TRIED = (1, 2, 4, 8, 16, 32)  # substeps, in this order

@@ -1,4 +1,4 @@
-"""A dynamical system xdot = f(x, u, t, p), written once in CasADi SX: the source of everything else."""
+"""A dynamical system xdot = f(x, u, t, p), or x+ = F(x, u, t, p), written once in CasADi SX: the source of all else."""
 
 from __future__ import annotations
 
@@ -31,6 +31,8 @@ _NONE = checks.FrozenSX(ca.SX(0, 1))
 class System:
     """xdot = f(x, u, t, p), x in the box [lbx, ubx] of R^nx, u in [lbu, ubu] of R^nu; t and p where f has them.
 
+    A system in discrete time, x+ = F(x, u, t, p), is made by System.discrete.
+
     Parameters
     ----------
     name : str
@@ -55,6 +57,7 @@ class System:
     angles : names
         The 2 pi periodic coordinates, by name.
     units : mapping from names to units, for axes and tables.
+    x_next, dt : of System.discrete
 
     Raises
     ------
@@ -74,6 +77,8 @@ class System:
     z: Any = field(default=None, kw_only=True)
     alg: Any = field(default=None, kw_only=True)
     z_guess: Any = field(default=None, kw_only=True)
+    x_next: Any = field(default=None, kw_only=True)
+    dt: float | None = field(default=None, kw_only=True)
     angles: Sequence[str] = field(default=(), kw_only=True)
     units: Mapping[str, str] = field(default_factory=dict, kw_only=True)
     _solution: ca.SX = field(default=_NONE, init=False)  # z
@@ -91,6 +96,8 @@ class System:
         lbx, ubx = checks.bounds(self.lbx, self.ubx, self.nx, ("lbx", "ubx"), owner, self.state_names)
         self._set(lbu=lbu, ubu=ubu, lbx=lbx, ubx=ubx)
         self._read_algebraic(owner)
+        if self.is_discrete or self.x_next is not None:
+            self._read_step(owner)
         if self.xdot is not None:
             self._set(xdot=self._expression(self.xdot, self.nx, "xdot", owner))
         self._solve_algebraic()
@@ -126,6 +133,16 @@ class System:
         self._set(alg=self._expression(alg, len(parts), "alg", owner) if parts else _NONE,
                   z_guess=self._expression([0.0] * len(parts) if guess is None else guess, len(parts), "z_guess", owner,
                                            z=False) if parts else None)
+
+    def _read_step(self, owner: str) -> None:
+        """x_next and dt, and xdot as what changes by a step in a unit of time."""
+        if not self.is_discrete or self.x_next is None:
+            given, missing = ("x_next", "dt") if self.x_next is not None else ("dt", "x_next")
+            raise ValueError(f"{owner}: {given} is given and {missing} is not; expected both, nocl.System.discrete"
+                             "(name, x=, u=, x_next=, dt=), or neither")
+        self._set(dt=checks.number(self.dt, "dt, the time between two samples,", owner, positive=True),
+                  x_next=self._expression(self.x_next, self.nx, "x_next", owner))
+        self._set(xdot=(self.x_next - self.x) / self.dt)
 
     def _solve_algebraic(self, longest: float = 0.0, low: Array | None = None, high: Array | None = None) -> None:
         """z as expressions of x and u in their boxes, t in [0, longest] and p in [low, high], nominal ones by default.
@@ -193,6 +210,19 @@ class System:
             what = f"the equation(s) of {', '.join(rows)}" if rows else "the Jacobian of xdot"
             raise ValueError(f"{owner}: {what} gives NaN or inf inside the box, at {at}; "
                              "expected finite values: change the equation or shrink lbx, ubx")
+
+    @property
+    def is_discrete(self) -> bool:
+        """Whether time goes in steps, x+ = F(x, u, t, p)."""
+        return self.dt is not None
+
+    def refuse_discrete(self, owner: str, remedy: str = "") -> None:
+        """ValueError where time goes in steps: for what is about continuous time."""
+        if self.is_discrete:
+            usual = ("System(..., xdot=...), or what takes steps: NMPC, DDP, LQR, nocl.train, nocl.simulate, "
+                     "nocl.comparisons.compare")
+            raise ValueError(f"{owner} is for systems in continuous time, and {self.name!r} is one in discrete time "
+                             f"(dt = {self.dt:g}); expected {remedy or usual}")
 
     @property
     def nx(self) -> int:
@@ -274,6 +304,14 @@ class System:
         return self.arguments.function("f", {"xdot": self.equations})
 
     @cached_property
+    def F(self) -> ca.Function:
+        """(x [nx], u [nu][, t][, p [np]]) -> x+ [nx], the step of a system in discrete time; ValueError for others."""
+        if not self.is_discrete:
+            raise ValueError(f"system {self.name!r} is one in continuous time, and F is the step of one in discrete "
+                             "time; expected nocl.System.discrete(name, x=, u=, x_next=, dt=): take f")
+        return self.arguments.function("F", {"x_next": self.without_z(self.x_next)})
+
+    @cached_property
     def algebraic(self) -> ca.Function:
         """(x [nx], u [nu][, t][, p [np]]) -> the algebraic variables z [nz], of a system that has some."""
         if not self.z.numel():
@@ -287,7 +325,10 @@ class System:
         return self.arguments.function("jacobian", {"A": A, "B": B})
 
     def linearize(self, x: ArrayLike, u: ArrayLike, t: float = 0.0, p: Any = None) -> tuple[Array, Array]:
-        """(A, B) at (x, u), as numpy arrays [nx, nx] and [nx, nu]; at time t and parameters p where f has them."""
+        """(A, B) at (x, u), as numpy arrays [nx, nx] and [nx, nu]; at time t and parameters p where f has them.
+
+        Of a system in discrete time they are those of a step, x+ = A x + B u.
+        """
         owner = f"{self.name}.linearize"
         x, u = checks.vector(x, self.nx, "x", owner), checks.vector(u, self.nu, "u", owner)
         rows = parameters.rows(p, self.parameter_names, 1, owner)
@@ -295,6 +336,8 @@ class System:
         if not (np.isfinite(A.full()).all() and np.isfinite(B.full()).all()):
             raise ValueError(f"{owner}: the Jacobian is NaN or inf at x = {checks.shown(x)}, u = {checks.shown(u)}; "
                              "expected a point where xdot is differentiable")
+        if self.dt is not None:
+            return np.eye(self.nx) + self.dt * A.full(), self.dt * B.full()
         return A.full(), B.full()
 
     def at(self, p: Any) -> System:
@@ -305,8 +348,8 @@ class System:
         def folded(e: Any) -> Any:
             return e if e is None else ca.substitute(e, self.p, ca.DM(value))
 
-        return replace(self, xdot=folded(self.xdot), alg=folded(self.alg), z_guess=folded(self.z_guess), p=None,
-                       units=units)
+        return replace(self, xdot=folded(self.xdot), x_next=folded(self.x_next), alg=folded(self.alg),
+                       z_guess=folded(self.z_guess), p=None, units=units)
 
     def with_inputs(self, low: Array, high: Array) -> System:
         """f(x, u, p) as f(x, (u, p)): the parameters after the controls, between low and high [np]."""
@@ -323,6 +366,9 @@ class System:
                                   ("controls", self.control_names, other.control_names), *parameters):
             if own != theirs:
                 return f"its {what} are {', '.join(theirs) or 'none'}, not {', '.join(own) or 'none'}"
+        if self.dt != other.dt:
+            mine, its = ("continuous" if s.dt is None else f"in steps of {s.dt:g}" for s in (self, other))
+            return f"its time is {its}, not {mine}"
         if not equations or self.xdot is None or other.xdot is None or self.xdot is other.xdot:
             return ""
         rng = np.random.default_rng(0)
@@ -340,15 +386,16 @@ class System:
         return {"t": rng.random(N_SAME), "p": usual * rng.uniform(0.8, 1.2, (N_SAME, self.np))}
 
     def under(self, f: ca.Function) -> System:
-        """The system with another f:(x, u[, t][, p]) -> xdot for its equations, in its own symbols and SX."""
+        """The system with another f:(x, u[, t][, p]) -> xdot for its equations, in its own symbols and SX; of a system
+        in discrete time with another F:(x, u[, t][, p]) -> x+."""
         sizes = [v.numel() for v in self.arguments.inputs]
         if not isinstance(f, ca.Function) or [f.numel_in(i) for i in range(f.n_in())] != sizes or \
                 [f.numel_out(i) for i in range(f.n_out())] != [self.nx]:
             form = ", ".join(f"{name} [{n}]" for name, n in zip(self.arguments.names, sizes, strict=True))
-            raise ValueError(f"{self.name}.under: f is {checks.shown(f)}; expected a casadi.Function ({form}) -> xdot "
-                             f"[{self.nx}]")
+            raise ValueError(f"{self.name}.under: f is {checks.shown(f)}; expected a casadi.Function ({form}) -> "
+                             f"{'x_next' if self.is_discrete else 'xdot'} [{self.nx}]")
         f = f if f.is_a("SXFunction") else instructions.expand(f)
-        return replace(self, xdot=f(*self.arguments.inputs))
+        return replace(self, **{"x_next" if self.is_discrete else "xdot": f(*self.arguments.inputs)})
 
     def unit(self, name: str) -> str:
         """The unit of a state, control or parameter for an axis label, like 'theta [rad]' or just 'theta'."""
@@ -360,12 +407,14 @@ class System:
             return f"{name} in [{low:g}, {high:g}]" + (" (angle)" if name in self.angles else "")
 
         counts = f"{counted(self.nx, 'state')}, {counted(self.nu, 'control')}"
-        lines = [f"System {self.name!r}: {counts}" + (f", {counted(self.np, 'parameter')}" if self.np else "")]
+        lines = [f"System {self.name!r}: {counts}" + (f", {counted(self.np, 'parameter')}" if self.np else "")
+                 + (f", in steps of {self.dt:g}" if self.is_discrete else "")]
         if self.xdot is None:
             lines.append("equations not known")
         else:
-            rows, shared = pretty.lines(ca.vertcat(self.xdot, self.alg), ca.vertcat(*self.arguments.inputs, self.z))
-            names = [*(f"d{n}/dt" for n in self.state_names), *["0"] * self.z.numel()]
+            right = self.x_next if self.is_discrete else self.xdot
+            rows, shared = pretty.lines(ca.vertcat(right, self.alg), ca.vertcat(*self.arguments.inputs, self.z))
+            names = [*(f"{n}+" if self.is_discrete else f"d{n}/dt" for n in self.state_names), *["0"] * self.z.numel()]
             lines += [pretty.wrapped(n, e) for n, e in zip(names, rows, strict=True)]
             lines += [pretty.wrapped(name, e, "    ") for name, e in shared.items()]
         lines.append(pretty.filled("X: " + ", ".join(map(interval, self.state_names, self.lbx, self.ubx))))
@@ -379,7 +428,8 @@ class System:
     def to_data(self) -> dict[str, Any]:
         """The system as plain JSON data, exact to the last bit."""
         return {"name": self.name, "x": list(self.state_names), "u": list(self.control_names),
-                "f": None if self.xdot is None else instructions.to_data(self.f),
+                "f": None if self.xdot is None or self.is_discrete else instructions.to_data(self.f),
+                **({"F": instructions.to_data(self.F), "dt": self.dt} if self.is_discrete else {}),
                 "angles": list(self.angles), "units": dict(self.units),
                 **({"p": parameters.to_data(self.p)} if self.np else {}),
                 **({"z": list(self.algebraic_names), "z_is": instructions.to_data(self.algebraic)}
@@ -397,11 +447,34 @@ class System:
             xdot = None if data["f"] is None else read(data["f"], at)
             z = ca.vertcat(ca.SX(0, 1), *map(ca.SX.sym, data.get("z", ())))
             alg = z - read(data["z_is"], at) if "z_is" in data else None
-            return System(data["name"], x=x, u=u, xdot=xdot, p=p, z=z, alg=alg, angles=data["angles"],
+            step = {"x_next": read(data["F"], at), "dt": data["dt"]} if "F" in data else {}
+            return System(data["name"], x=x, u=u, xdot=xdot, **step, p=p, z=z, alg=alg, angles=data["angles"],
                           units=data["units"], **{name: data[name] for name in ("lbu", "ubu", "lbx", "ubx")})
         except MALFORMED as error:
             raise ValueError(f"not a System written by nocl: {type(error).__name__}: {error}; expected what to_data "
                              "gave") from error
+
+    @staticmethod
+    def discrete(name: str, x: ca.SX, u: ca.SX, x_next: ca.SX, *, dt: float = 1.0, **options: Any) -> System:
+        """A system in discrete time, x+ = F(x, u, t, p): its state is sampled, and its control set, every dt.
+
+        Parameters
+        ----------
+        name, x, u : as System has them
+        x_next : casadi.SX
+            F, nx expressions in x, u, p and the time nocl.time(), which is k dt at sample k = 0, 1, ...
+        dt : float
+            The time between two samples, in the user's unit of time. With the default 1 times are numbers of samples.
+        options : lbu, ubu, lbx, ubx, and p, z, alg, z_guess, angles, units, as System has them
+
+        A problem on it costs the sum of dt L(x_k, u_k, k dt, p) over its steps, and G; its horizon is a whole number of
+        dt, and solvers have as many intervals. F is taken as it is: `system.F` is (x, u[, t][, p]) -> x+, and `f` and
+        xdot are (F - x) / dt, what changes in a unit of time. Constraints hold at the samples. What is about continuous
+        time (identification, level sets, implicit steps, nocl.Free, ...) refuses such systems.
+
+        Raises ValueError with what was got, what was expected and the remedy.
+        """
+        return System(name, x, u, None, x_next=x_next, dt=dt, **options)
 
     @staticmethod
     def from_casadi(f: ca.Function, *, lbu: Vector, ubu: Vector, lbx: Vector, ubx: Vector, **options: Any) -> System:

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from nocl.definition import parameters
+from nocl.definition import discrete, parameters
 from nocl.definition.ocp import OCP
 from nocl.definition.system import System
 from nocl.support import checks
@@ -26,13 +26,14 @@ def to_control(system: System, x: ArrayLike | None = None, u: ArrayLike | None =
     there.
 
     Parameters are its `params`, by name, with their nominal values where they have some. Held controls, such as NMPC's,
-    go through `held_inputs`.
+    go through `held_inputs`. A system in discrete time is one there too, with its dt.
     """
     if (x is None) != (u is None):
         raise ValueError(f"to_control({system.name}): got one of x and u; expected both, or neither")
     if x is not None and u is not None:
         return _statespace(system, x, u, t, p)
-    control, f, names = package("control"), system.f, system.parameter_names
+    control, names = package("control"), system.parameter_names
+    f = system.F if system.is_discrete else system.f
 
     def update(t: float, x: Array, u: Array, params: Any) -> Array:
         given = parameters.rows({n: params[n] for n in names if n in params}, names, 1, f"{system.name}: params")
@@ -40,7 +41,13 @@ def to_control(system: System, x: ArrayLike | None = None, u: ArrayLike | None =
 
     nominal = {n: value for n, value in zip(names, system.nominal.tolist(), strict=True) if np.isfinite(value)}
     return control.NonlinearIOSystem(update, None, inputs=list(system.control_names), outputs=list(system.state_names),
-                                     states=list(system.state_names), name=system.name, params=nominal)
+                                     states=list(system.state_names), name=system.name, params=nominal,
+                                     **_sampling(system))
+
+
+def _sampling(system: System) -> dict[str, Any]:
+    """python-control's word for the time between two samples; nothing in continuous time."""
+    return {"dt": system.dt} if system.is_discrete else {}
 
 
 def held_inputs(t: ArrayLike, u: ArrayLike) -> tuple[Array, Array]:
@@ -65,7 +72,7 @@ def _statespace(system: System, x: ArrayLike, u: ArrayLike, t: float, p: Any) ->
     A, B = system.linearize(x, u, t, p)
     return package("control").StateSpace(A, B, np.eye(system.nx), np.zeros((system.nx, system.nu)),
                                          inputs=list(system.control_names), outputs=list(system.state_names),
-                                         states=list(system.state_names), name=system.name)
+                                         states=list(system.state_names), name=system.name, **_sampling(system))
 
 
 def to_do_mpc(system: System) -> Any:
@@ -73,6 +80,7 @@ def to_do_mpc(system: System) -> Any:
 
     Raises ValueError for an f that holds the time: do-mpc's models have none.
     """
+    system.refuse_discrete("to_do_mpc", "one with xdot, or a do-mpc model of your own, Model('discrete')")
     if system.uses_time:
         raise ValueError(f"to_do_mpc: f of {system.name!r} holds the time; expected f(x, u, p): make it a state, with "
                          "derivative 1")
@@ -88,6 +96,7 @@ def to_do_mpc(system: System) -> Any:
 
 def to_acados(system: System) -> Any:
     """acados' AcadosModel of the system: x, u, xdot (t, p), explicit and implicit equations, in SX."""
+    system.refuse_discrete("to_acados", "one with xdot, or a model of your own with disc_dyn_expr")
     try:
         model = package("acados_template").AcadosModel()
     except ValueError as error:
@@ -101,8 +110,9 @@ def to_acados(system: System) -> Any:
     return model
 
 
-def to_gymnasium(ocp: OCP, *, steps: int = 80, integrator: str = "rk4", observe_time: bool = True) -> Any:
-    """A gymnasium.Env of the problem: `steps` equal intervals over the horizon, controls held and clipped to U.
+def to_gymnasium(ocp: OCP, *, steps: int | None = None, integrator: str = "rk4", observe_time: bool = True) -> Any:
+    """A gymnasium.Env of the problem: `steps` equal intervals over the horizon (default 80; in discrete time its own
+    steps, and no other number), controls held and clipped to U.
 
     Observations are x, then t (unless observe_time is False), then p, float64; on a problem with parameters each
     episode has its own. Actions are u in U; the reward of a step is minus the integral of L over it, in the last step
@@ -112,13 +122,16 @@ def to_gymnasium(ocp: OCP, *, steps: int = 80, integrator: str = "rk4", observe_
     integrator: "rk4", the discretisation of NMPC, or "cvodes", the judge's. Path constraints are reported, and not in
     the reward.
     """
-    if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
+    if steps is not None and (isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1):
         raise ValueError(f"to_gymnasium: steps is {steps!r}; expected an integer >= 1")
     if integrator not in ("rk4", "cvodes"):
         raise ValueError(f"to_gymnasium: integrator is {integrator!r}; expected 'rk4' or 'cvodes'")
+    if integrator == "cvodes":
+        ocp.system.refuse_discrete("to_gymnasium with integrator='cvodes'", "none: leave it out, steps are F itself")
     ocp.refuse_constraints("to_gymnasium", "put a penalty for them into the running cost, which the reward is made of")
     gymnasium = package("gymnasium")
-    step = _step(ocp, ocp.horizon / steps, integrator)
+    steps = discrete.intervals_of(ocp, steps, "to_gymnasium")
+    step = _step(ocp, ocp.system.dt or ocp.horizon / steps, integrator)
     return _environment(gymnasium, ocp, int(steps), step, observe_time)
 
 

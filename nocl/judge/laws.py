@@ -38,6 +38,8 @@ def dynamics_function(ocp: OCP, f: Any) -> ca.Function:
     s = ocp.system
     if f is None:
         return ocp.functions.f
+    s.refuse_discrete("a plant or model that is given as f or dynamics, (x, u) -> xdot,", "a problem on the other "
+                      "system, dataclasses.replace(ocp, system=ocp.system.under(F)), F: (x, u) -> x_next")
     g = f if isinstance(f, ca.Function) else _converted(f)
     if g is None:
         raise ValueError(f"the dynamics are a {type(f).__name__}; expected a casadi.Function (x, u) -> xdot, "

@@ -194,7 +194,8 @@ class Judge:
 
     def held(self, ask: Ask, x0: Array, t: Array, jumps: list[tuple[float, Array]], delay: float = 0.0) -> Simulation:
         B, nx, K, nu = len(x0), x0.shape[1], len(t) - 1, self.ocp.system.nu
-        step, least = Step(self), np.full((B, len(self.ocp.functions.rows)), np.inf)
+        step = Mapped(self) if self.ocp.system.is_discrete else Step(self)
+        least = np.full((B, len(self.ocp.functions.rows)), np.inf)
         x, u = np.full((B, K + 1, nx), np.nan), np.full((B, K + 1, nu), np.nan)
         z, message = np.c_[x0, np.zeros(B)], [""] * B
         for k in range(K):
@@ -224,6 +225,8 @@ class Judge:
         t [m + 1] are the times of both."""
         if self.ocp.states_only:
             return measured.least(self.ocp, path, t[1:], self.p)
+        if self.ocp.system.is_discrete:  # at the next sample another control acts
+            return measured.least_held(self.ocp, start, u[:, None], t[:1], self.p)
         x = np.concatenate([start, path], axis=1)
         return measured.least_held(self.ocp, x, np.repeat(u[:, None], len(t), axis=1), t, self.p)
 
@@ -328,6 +331,27 @@ class Step:
             else:
                 path[i], z[i] = end[:-1].T, end[:, -1]
         return path
+
+
+class Mapped:
+    """Steps of a system in discrete time, all states at once."""
+
+    grid = np.ones(1)
+
+    def __init__(self, judge: Judge) -> None:
+        self.judge, self.of = judge, judge.ocp.functions
+
+    def run(self, z: Array, u: Array, a: float, b: float, message: list[str]) -> Array:
+        """As Step.run has it: one step, from the sample at a to that at b."""
+        nx, t = z.shape[1] - 1, np.full(len(z), a)
+        given = self.of.arguments.columns(x=z[:, :nx], u=u, t=t, p=self.judge.p)
+        after, cost = (out.full().T for out in self.of.sample(*given))
+        end, alive = np.c_[after, z[:, nx:] + cost], np.array([not m for m in message])
+        good = alive & np.isfinite(end).all(axis=1)
+        for i in np.flatnonzero(alive & ~good):
+            message[i] = failure("the state blows up", a, z[i, :nx], b)
+        z[good] = end[good]
+        return np.where(good[:, None, None], z[:, None, :nx], np.nan)
 
 
 def failure(what: str, t: float, x: Array, until: float | None = None) -> str:

@@ -8,6 +8,9 @@ Three kinds of control are judged alike:
   of K equal intervals, its answer held;
 - open loop, where it is an array u [B, K, nu]: held.
 
+A system in discrete time is iterated, x+ = F(x, u, t, p): feedback of either kind is asked at every sample, and
+constraints are judged there.
+
 Where the horizon is free feedback runs until it arrives, and plans to their own ends (arrival.py).
 
 On a problem with parameters they are functions of (x, t, p), p [B, np]; those of a problem without, of (x, t).
@@ -25,6 +28,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
+from nocl.definition import discrete
 from nocl.definition.constraints import TOLERANCE
 from nocl.definition.ocp import OCP
 from nocl.judge.arrival import arriving, arriving_held, planned
@@ -34,11 +38,12 @@ from nocl.support import checks
 from nocl.support.checks import Array
 
 Kicks = Sequence[tuple[float, ArrayLike]]
+NODES = 81  # that continuous feedback is recorded at, where nobody says
 
 
-def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: int | None = None, nodes: int = 81,
-             kicks: Kicks | None = None, delay: float = 0.0, t0: float = 0.0, p: Any = None, rtol: float = 1e-9,
-             atol: float = 1e-10, tolerance: float = TOLERANCE, horizon: ArrayLike | None = None,
+def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: int | None = None,
+             nodes: int | None = None, kicks: Kicks | None = None, delay: float = 0.0, t0: float = 0.0, p: Any = None,
+             rtol: float = 1e-9, atol: float = 1e-10, tolerance: float = TOLERANCE, horizon: ArrayLike | None = None,
              duration: float | None = None) -> Simulation:
     """Run and score a controller on an OCP from states x0 [nx] or [B, nx].
 
@@ -49,7 +54,7 @@ def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: i
     f : casadi.Function (x, u[, t][, p]) -> xdot, or an object with `to_casadi()`
         Another plant than the exact one.
     hold : K, sample the feedback at K equal intervals; default: continuous where it can be, else nodes - 1
-    nodes : number of nodes that continuous feedback is recorded at
+    nodes : number of nodes that continuous feedback is recorded at; default: 81
     kicks : (time, dx [nx] or [B, nx]), added to the state at that time
     delay : time from a sample of the state to its control, at most an interval; the last control acts meanwhile. The
         first control is there at once: where a run starts is known before it does
@@ -61,13 +66,17 @@ def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: i
     Where the horizon is free, feedback runs until it arrives: until all terminal constraints hold within the tolerance.
     `hold` then counts parts of the longest horizon, `nodes` those of each run. One that does not arrive has failed.
 
+    A system in discrete time has a node and a control for each sample from t0 on: `hold` and `nodes` are these or left
+    out, kicks come at samples, and there is no delay.
+
     Raises ValueError for shapes that do not fit. A state that blows up or a NaN control is a row with success False.
     """
-    checks.problem(ocp, "simulate", infinite=True)
+    checks.problem(ocp, "simulate", infinite=True, discrete=True)
     check_made_for(ocp, controller, "the controller")
     ocp = _lasting(ocp, duration)
     rows, _ = checks.states(x0, ocp.system.nx, ocp.system.name)
-    t0 = _check_options(ocp, hold, nodes, t0)
+    t0, asked = _check_options(ocp, hold, nodes, t0), nodes
+    nodes = NODES if nodes is None else nodes
     for name, value in (("rtol", rtol), ("atol", atol)):
         checks.number(value, name, "simulate", positive=True)
     most = checks.number(tolerance, "tolerance", "simulate")
@@ -82,6 +91,8 @@ def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: i
     if horizon is not None:
         raise ValueError(f"simulate: horizon is {checks.shown(horizon)}; expected none where the problem's own is no "
                          "nocl.Free")
+    if ocp.system.is_discrete:
+        return _in_steps(judge, controller, policy, rows, _samples(ocp, t0, hold, asked, delay), jumps)
     if policy is not None and hold is None:
         _check_delay(delay, 0.0, "continuous feedback: give `hold`")
         return judge.continuous(policy, rows, np.linspace(t0, ocp.horizon, nodes), jumps)
@@ -105,11 +116,40 @@ def _lasting(ocp: OCP, duration: float | None) -> OCP:
     return ocp
 
 
-def _check_options(ocp: OCP, hold: int | None, nodes: int, t0: float) -> float:
+def _samples(ocp: OCP, t0: float, hold: int | None, nodes: int | None, delay: float) -> Array:
+    """The times of the samples from t0 to the horizon; ValueError where others are asked for."""
+    s = ocp.system
+    first, steps = discrete.first_step(ocp, t0, "simulate"), ocp.steps
+    assert steps is not None
+    left = steps - first
+    for name, value, own in (("hold", hold, left), ("nodes", nodes, left + 1), ("delay", delay, 0.0)):
+        if value not in (None, own):
+            raise ValueError(f"simulate: {name} is {value!r}, and {s.name!r} is a system in discrete time, with {left} "
+                             f"steps of dt = {s.dt:g} from t0 = {t0:g} on; expected {own}: leave it out")
+    return discrete.samples(s, first, steps)
+
+
+def _in_steps(judge: Judge, controller: Any, policy: ca.Function | None, x0: Array, t: Array,
+              jumps: list[tuple[float, Array]]) -> Simulation:
+    """Runs of a system in discrete time with the samples t [K+1]."""
+    ocp, K, s = judge.ocp, len(t) - 1, judge.ocp.system
+    assert s.dt is not None
+    moved = [(s.dt * discrete.steps_in(s, when, "the time of a kick", "simulate"), dx) for when, dx in jumps]
+    if not isinstance(controller, (np.ndarray, list, tuple)):
+        return judge.held(_feedback(ocp, controller, policy, judge.p), x0, t, moved)
+    u = _controls(ocp, controller, len(x0), None)
+    if u.shape[1] != K:
+        raise ValueError(f"controls have shape {np.shape(controller)}; expected K = {K}, one for each step of "
+                         f"dt = {s.dt:g} from t0 = {t[0]:g} to {t[-1]:g}")
+    return judge.held(lambda x, t, k: np.asarray(u[:, k]), x0, t, moved)
+
+
+def _check_options(ocp: OCP, hold: int | None, nodes: int | None, t0: float) -> float:
     """t0, a float; ValueError where one of them is wrong."""
     if hold is not None:
         checks.whole(hold, "hold", "simulate (None: continuous feedback)", 1)
-    checks.whole(nodes, "nodes", "simulate", 2)
+    if nodes is not None:
+        checks.whole(nodes, "nodes", "simulate", 2)
     return checks.start_time(t0, ocp.longest)
 
 

@@ -15,8 +15,8 @@ _INTEGER = ("controls are continuous in [lbu, ubu]: solve one problem for each m
             "callable round what the law answers, and have it judged by nocl.simulate")
 _ALGEBRAIC = ("algebraic equations are semi-explicit, System(..., z=z, alg=...), 0 = alg(x, z, u, t, p) of index 1: "
               "make what multiplies xdot an equation for a z of its own, M z = f with xdot = z")
-_DISCRETE = ("xdot is a rate in continuous time; the solvers hold controls on `intervals`, a law is sampled by "
-             "nocl.simulate(..., hold=K): give the equations whose step this is")
+_DISCRETE = ("a system in discrete time is nocl.System.discrete(name, x=, u=, x_next=, dt=); in continuous time the "
+             "solvers hold controls on `intervals`, and a law is sampled by nocl.simulate(..., hold=K)")
 _OUTPUT = ("a law sees all states: put an observer before it, u = law(estimate, t), and have that callable judged by "
            "nocl.simulate")
 _NOISE = ("f is deterministic; what noise, kicks and wrong models cost a law is in nocl.comparisons.study(..., "
@@ -28,7 +28,7 @@ ASKED: Mapping[str, tuple[str, str]] = {word: answer for words, answer in (
     (("delay", "delays", "dead_time", "lag"), ("delays", _DELAY)),
     (("integer", "integers", "integrality", "discrete_controls", "binary"), ("integer controls", _INTEGER)),
     (("algebraic", "constraints_alg", "M", "mass_matrix"), ("implicit equations", _ALGEBRAIC)),
-    (("dt", "ts", "Ts", "sample_time", "discrete", "x_next"), ("discrete time", _DISCRETE)),
+    (("dt", "ts", "Ts", "sample_time", "discrete", "x_next"), ("sampling times", _DISCRETE)),
     (("y", "output", "outputs", "measurement", "measurements", "h"), ("measured outputs", _OUTPUT)),
     (("noise", "disturbance", "w", "stochastic"), ("noise", _NOISE)),
     (("du_max", "du_min", "rate", "rates", "rterm"), ("limits of rates", _RATES)),

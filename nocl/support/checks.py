@@ -287,8 +287,9 @@ def expression(value: Any, rows: int, allowed: ca.SX, name: str, owner: str, con
     return FrozenSX(ca.densify(value))
 
 
-def problem(ocp: Any, owner: str, infinite: bool = False) -> None:
-    """Raises ValueError for what is no nocl.OCP, and, unless `infinite`, for one whose horizon is."""
+def problem(ocp: Any, owner: str, infinite: bool = False, discrete: bool = False) -> None:
+    """Raises ValueError for what is no nocl.OCP, and for one whose horizon is infinite, or whose system has discrete
+    time, unless `infinite` and `discrete` say that these are taken."""
     if not (hasattr(ocp, "system") and hasattr(ocp, "initial_states")):
         raise ValueError(f"{owner}: the problem is a {type(ocp).__name__}; expected a nocl.OCP: "
                          "nocl.OCP(system, ...) or nocl.load_ocp(name)")
@@ -296,6 +297,8 @@ def problem(ocp: Any, owner: str, infinite: bool = False) -> None:
         raise ValueError(f"{owner} takes a horizon that ends, and that of the problem on {ocp.system.name!r} is "
                          "INFINITE; expected a number: train a law, nocl.train(ocp), or let it last for a while, "
                          "ocp.lasting(10)")
+    if not discrete:
+        ocp.system.refuse_discrete(owner)
 
 
 def _why(error: Exception) -> str:

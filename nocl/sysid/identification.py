@@ -265,6 +265,7 @@ def identify(system: System, *, data: Dataset | Log | None = None, method: str =
         Where the labels speak against what is stated.
     """
     settings = _check_arguments(system, method, gradients, settings, seed, data)
+    system.refuse_discrete("nocl.identify")
     plant, system = system, _widened(system, parameters, control_affine)
     stated, start = Stated.of(system, known, control_affine), time.perf_counter()
     bar = Progress(system.name, progress, _time_of(settings))

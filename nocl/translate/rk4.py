@@ -25,6 +25,16 @@ def rk4_interval(f: Field, x: Any, u: Any, h: Any, substeps: int = 1) -> Any:
     return x
 
 
+def map_cost(f: Moment, L: Moment, x: Any, u: Any, h: Any, t: Any = None) -> tuple[Any, Any]:
+    """(the next state, the cost) of a step of a discrete-time system: f is (x+ - x) / dt there, and h is dt, or 0 where
+    nothing moves.
+
+    t : the time at its start, where f and L are functions of (x, u, t)
+    """
+    now = [] if t is None else [t]
+    return x + h * f(x, u, *now), h * L(x, u, *now)
+
+
 def rk4_cost(f: Moment, L: Moment, x: Any, u: Any, h: Any, substeps: int = 1, t: Any = None) -> tuple[Any, Any]:
     """(the state after an interval, the integral of L over it): the same RK4 stages quadrate the cost.
 

@@ -54,7 +54,7 @@ class CND:
 
     def __init__(self, ocp: OCP, policy: FeatureNet, value: FeatureNet | None = None,
                  card: Mapping[str, Any] | None = None) -> None:
-        checks.problem(ocp, "CND", infinite=True)
+        checks.problem(ocp, "CND", infinite=True, discrete=True)
         checks.instance(FeatureNet, policy, "policy", "CND", "as nocl.train makes it")
         if value is not None:
             checks.instance(FeatureNet, value, "value", "CND", "as nocl.train makes it, or None")
@@ -167,12 +167,15 @@ class CND:
 
     def closed_loop_to_casadi(self, dynamics: Any = None, backend: str = "native",
                               build_dir: Build = None) -> ca.Function:
-        """closed_loop:(x [nx], t[, p]) -> (xdot [nx]), xdot = f(x, pi(x, t)).
+        """closed_loop:(x [nx], t[, p]) -> (xdot [nx]), xdot = f(x, pi(x, t)); in discrete time -> (x_next [nx]).
 
         dynamics: another f than the exact one, a casadi.Function (x, u) -> xdot or an object with `to_casadi()`.
         """
         pi, f = self.to_casadi(backend, build_dir), self.ocp.functions.on(dynamics_function(self.ocp, dynamics)).f
         at = Arguments.of(pi)
+        if self.ocp.system.is_discrete:
+            f = self.ocp.functions.sample
+            return at.function("closed_loop", {"x_next": ca.densify(at.given(u=at.call(pi)).call(f)[0])})
         return at.function("closed_loop", {"xdot": ca.densify(at.given(u=at.call(pi)).call(f))})
 
     def export_parts(self) -> list[ExportPart]:
@@ -187,8 +190,9 @@ class CND:
                 ExportPart("gain", self.gain_to_casadi(), lambda *at: _slopes(policy, *at), box, x | {"K": slopes},
                            lean=_lean(self.to_casadi(), "gain", "K"))]
         if s.xdot is not None:  # a plant that is not known has no closed loop to write down
-            made.append(ExportPart("closed_loop", self.closed_loop_to_casadi(), self._closed_loop, box,
-                                   x | {"xdot": [f"d {i} / dt" for i in s.state_names]}))
+            moved = {"x_next": [f"{i}+" for i in s.state_names]} if s.is_discrete else \
+                {"xdot": [f"d {i} / dt" for i in s.state_names]}
+            made.append(ExportPart("closed_loop", self.closed_loop_to_casadi(), self._closed_loop, box, x | moved))
         if value is not None:
             made += [ExportPart("value", self.value_to_casadi(), value, box, x | {"V": ["cost-to-go"]}, value),
                      ExportPart("value_gradient", self.value_gradient_to_casadi(),
@@ -252,12 +256,13 @@ class CND:
 
     def _closed_loop(self, x: Tensor, t: Tensor, *p: Tensor) -> Tensor:
         at = {"x": x, "u": self.policy(x, t, *p), "t": t, "p": p[0] if p else None}
-        return self._f(*(at[name] for name in self.ocp.functions.arguments.names))
+        moved = self._f(*(at[name] for name in self.ocp.functions.arguments.names))
+        return moved[0] if self.ocp.system.is_discrete else moved
 
     @cached_property
     def _f(self) -> Any:
-        """f in torch."""
-        return to_torch(self.ocp.functions.f)
+        """f in torch; in discrete time (x+, the step's cost)."""
+        return to_torch(self.ocp.functions.sample if self.ocp.system.is_discrete else self.ocp.functions.f)
 
     def _tensors(self, rows: Array, t: ArrayLike, p: Any) -> tuple[Tensor, ...]:
         times = checks.numeric(t, "t", self.ocp.system.name, f"one time or {len(rows)}")

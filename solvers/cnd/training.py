@@ -29,6 +29,7 @@ import numpy as np
 import torch
 
 from nocl.data import Solution
+from nocl.definition import discrete
 from nocl.definition.ocp import OCP
 from nocl.definition.sampling import own_numbers
 from nocl.definition.substeps import FINE, RADAU, RK4, Steps
@@ -147,6 +148,8 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
     usual = TrainSettings.of("normal", parameters=ocp.np)
     chosen = usual if settings is None else _expect(settings, TrainSettings)
     chosen = chosen if minutes is None else replace(chosen, minutes=minutes)
+    if ocp.system.is_discrete:
+        chosen = _in_steps(ocp, dynamics, chosen)
     if ocp.is_infinite:
         check_stationary(ocp, dynamics, chosen)
         return StationaryTraining(ocp, chosen, seed, progress, own).run()
@@ -154,6 +157,19 @@ def train(ocp: OCP, dynamics: LearnedDynamics | None = None, *, method: str = "d
         check_law(ocp, dynamics, chosen)
         return LawTraining(ocp, chosen, seed, progress, own).run()
     return Training(ocp, dynamics, _gridded(ocp, dynamics, chosen), seed, out, progress, own, begin).run()
+
+
+def _in_steps(ocp: OCP, dynamics: LearnedDynamics | None, s: TrainSettings) -> TrainSettings:
+    """The settings in discrete time, where the steps are given; ValueError for what is about continuous time."""
+    if dynamics is not None:
+        ocp.system.refuse_discrete("training on learned dynamics", "no dynamics: it is trained on F itself")
+    if ocp.is_infinite:
+        ocp.system.refuse_discrete("training on an INFINITE horizon", "a horizon of many steps, or "
+                                   "nocl.solvers.LQR(ocp), whose gain is the same for ever")
+    if s.control_dt:
+        ocp.system.refuse_discrete("training with control_dt", "control_dt=False: a control is held for a step")
+    discrete.check_steps(ocp.system, s.substeps, None if s.integrator == AUTO else s.integrator, "train")
+    return replace(s, intervals=discrete.intervals_of(ocp, s.intervals, "train"))
 
 
 def estimate(ocp: OCP, settings: TrainSettings, seed: int = 0) -> str:
@@ -200,6 +216,8 @@ def _steps(ocp: OCP, dynamics: LearnedDynamics | None, s: TrainSettings, interva
     if dynamics is not None and s.integrator == RADAU:
         raise ValueError("train: integrator='radau' makes steps of the exact f, and training is on learned dynamics; "
                          "expected 'auto' or 'rk4', with more substeps or intervals where the plant is fast")
+    if ocp.system.is_discrete:
+        return discrete.check_steps(ocp.system, s.substeps, None, "train")
     usual = None if dynamics is None else RK4
     integrator = usual if s.integrator == AUTO else s.integrator
     if s.substeps:
@@ -224,7 +242,8 @@ class Training:
         self.plain = DDP(ocp, intervals=settings.grid, substeps=self.substeps,
                          constraints="hard" if self.held is None else "elastic", **same)
         finer = self.substeps if self.integrator == RADAU else -(-self.substeps // 4)  # layers are as thin as they were
-        self.fine = DDP(ocp, intervals=4 * settings.grid, substeps=finer, **same)
+        finest = settings.grid if ocp.system.is_discrete else 4 * settings.grid
+        self.fine = DDP(ocp, intervals=finest, substeps=finer, **same)
         self.solved: list[Solution] = []  # what the labels are of, where constraints have margins that may change
         self._inside(None if self.held is None else self.held.first)
         self.checkpoint = None if out is None else Path(out) / CHECKPOINT
@@ -339,7 +358,8 @@ class Training:
         labels, best = labels[best.success], best[best.success]
         if not len(best):
             return "no held-out state was solved"
-        lost = summary(labels_gap(self.in_torch, labels, best, self.fine.substeps), "labels")["labels_median"]
+        lost = 0.0 if self.ocp.system.is_discrete else \
+            summary(labels_gap(self.in_torch, labels, best, self.fine.substeps), "labels")["labels_median"]
         row["floor"] = {"labels_median": lost, "by": floored_by(row, lost, s.grid, s.gap_median)}
         return str(row["floor"]["by"])
 

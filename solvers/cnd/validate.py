@@ -191,7 +191,7 @@ def value_scores(value: FeatureNet, policy: Policy, torch_ocp: InTorch,
 
     J_small is SMALL of the mean |J*| of the first set: a tail that costs next to nothing is no measure. Slopes are by
     usual states, so that units change nothing. The residual V_t + L + V_x' f is taken at the policy's u along the last
-    set, in units of its mean running cost.
+    set, in units of its mean running cost; there is none in discrete time.
     """
     row: dict[str, float] = {}
     usual, small = usual_sizes(torch_ocp.ocp).x, SMALL * np.abs(next(iter(optima.values())).cost).mean()
@@ -204,7 +204,7 @@ def value_scores(value: FeatureNet, policy: Policy, torch_ocp: InTorch,
         cosine = np.clip((slope * costate).sum(axis=1) / (size * true), -1, 1)
         row[f"{name}_degrees"] = float(np.degrees(np.median(np.arccos(cosine))))
         row[f"{name}_slope_error"] = float(np.median(np.abs(size / true - 1)))
-    return row | _hjb(value, policy, torch_ocp, list(optima.values())[-1])
+    return row if torch_ocp.ocp.system.is_discrete else row | _hjb(value, policy, torch_ocp, list(optima.values())[-1])
 
 
 def _value_and_slope(value: FeatureNet, x: Array, t: Array, p: list[Tensor]) -> tuple[Array, Array]:

@@ -32,6 +32,7 @@ class SolutionBank:
     scale: Array  # [nx + np], one unit of distance in each state, then in each parameter
     periodic: tuple[int, ...] = ()  # states that are the same 2 pi further (OCP.periodic): distances are to images
     several: int = 1  # how many of the nearest solutions are worth a look
+    in_steps: bool = False  # whether time is discrete: what starts later has fewer steps, of the same length
 
     def __len__(self) -> int:
         return len(self.solution)
@@ -52,7 +53,8 @@ class SolutionBank:
         if np.isnan(kept.gain).any():
             raise ValueError(f"a bank follows its solutions of {ddp.ocp.system.name} by their gain, which is NaN: "
                              "take those of DDP, or of NMPC.solve(x0, gains=True)")
-        return SolutionBank(replace(kept, tried=None, dense=None), spread(ddp.ocp, kept.x, kept.p), ddp.ocp.periodic)
+        return SolutionBank(replace(kept, tried=None, dense=None), spread(ddp.ocp, kept.x, kept.p), ddp.ocp.periodic,
+                            in_steps=ddp.ocp.system.is_discrete)
 
     @staticmethod
     def from_arrays(ddp: DDP, arrays: dict[str, Any]) -> SolutionBank:
@@ -78,7 +80,7 @@ class SolutionBank:
 
         arrays = {name: value for name, value in self.solution.arrays().items() if name != "message"}
         return store.save_checkpoint(Path(folder) / FILE, {"solution": arrays, "scale": self.scale},
-                                     {"kind": KIND, "periodic": list(self.periodic)})
+                                     {"kind": KIND, "periodic": list(self.periodic), "in_steps": self.in_steps})
 
     @staticmethod
     def load(folder: str | os.PathLike[str]) -> SolutionBank:
@@ -91,7 +93,8 @@ class SolutionBank:
         state, meta = store.load_checkpoint(path)
         if meta.get("kind") != KIND:
             raise ValueError(f"{path} is no solution bank; expected a file of SolutionBank.save: name the right folder")
-        return SolutionBank(_solution(state["solution"]), state["scale"], tuple(meta.get("periodic", ())))
+        return SolutionBank(_solution(state["solution"]), state["scale"], tuple(meta.get("periodic", ())),
+                            in_steps=bool(meta.get("in_steps", False)))
 
     def interpolate(self, x: ArrayLike, t: ArrayLike = 0.0, p: Array | None = None) -> tuple[Array, Array, Array]:
         """(u, V, V_x) at states x [B, nx] and times t [B]: the nearest solution's, with u and V to first order in the
@@ -143,7 +146,10 @@ class SolutionBank:
         """
         start = np.broadcast_to(np.asarray(t0, dtype=np.float64), rows.shape)
         part = np.arange(self.solution.u.shape[1] + 1) / self.solution.u.shape[1]
-        made = self._along(rows, start[:, None] + (self.horizon - start)[:, None] * part)
+        dt = np.diff(self.solution.t[0, :2])
+        times = start[:, None] + (self.horizon - start)[:, None] * part if not self.in_steps else \
+            np.minimum(start[:, None] + dt * np.arange(len(part)), self.horizon)
+        made = self._along(rows, times)
         if x is not None and self.periodic:
             made["x"] += self._turns(x, made["x"][:, 0])[:, None]
         return made

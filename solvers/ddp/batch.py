@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -15,6 +15,7 @@ from nocl.support.checks import Array
 
 Rows = NDArray[np.int64]  # problem numbers
 MOST = 1024  # problems in a piece: fills many threads, and shows progress
+AT_NODES = ("t", "x", "V", "V_x", "V_xx")  # of a Solution
 BYTES = 2**28  # ... and what its trajectories, gains and curvatures take at most
 
 
@@ -93,6 +94,39 @@ def pieces(ddp: Descent, x0: Array, t0: Array, guess: dict[str, Array], curvatur
     parts = (slice(i, i + n) for i in range(0, max(len(x0), 1), n))
     return [Piece(f"piece-{at.start:09d}", at.start, x0[at], t0[at], {k: v[at] for k, v in guess.items()}, curvature,
                   None if p is None else p[at]) for at in parts]
+
+
+def of_lengths(batch: Piece, left: Rows) -> Iterator[tuple[int, Rows, Piece]]:
+    """The problems of a piece by their numbers of intervals, left [n]: (that number, their rows, a piece of them)."""
+    for n in map(int, np.unique(left)):
+        rows = np.flatnonzero(left == n)
+        guess = {name: np.ascontiguousarray(value[rows, :n + (name == "x")]) for name, value in batch.guess.items()}
+        yield n, rows, replace(batch, x0=batch.x0[rows], t0=batch.t0[rows], guess=guess,
+                               p=None if batch.p is None else batch.p[rows])
+
+
+def by_length(batch: Piece, most: int, left: Rows, solve: Callable[[int, Piece], Solution]) -> Solution:
+    """A piece whose problems have left [n] intervals, solved by solve(intervals, part), as one of `most` intervals."""
+    parts = [(rows, lengthened(solve(n, part), most)) for n, rows, part in of_lengths(batch, left)]
+    if len(parts) == 1:
+        return parts[0][1]
+    whole = Solution.join([part for _, part in parts])
+    return whole[np.argsort(np.concatenate([rows for rows, _ in parts]))]
+
+
+def lengthened(s: Solution, most: int) -> Solution:
+    """A solution whose end stands still until there are `most` intervals, under the last control."""
+    K = s.u.shape[1]
+    if most == K:
+        return s
+    nodes: dict[str, Any] = {name: stretched(value, most + 1) for name, value in s.arrays().items() if name in AT_NODES}
+    gain = np.concatenate([s.gain, np.zeros((len(s), most - K, *s.gain.shape[2:]))], axis=1)
+    return replace(s, **nodes, u=stretched(s.u, most), gain=gain)
+
+
+def stretched(values: Array, n: int) -> Array:
+    """values [B, m, ...] as [B, n, ...], the last one again and again."""
+    return np.concatenate([values, np.repeat(values[:, -1:], n - values.shape[1], axis=1)], axis=1)
 
 
 def assembled(n: int, parts: Iterable[Solved]) -> Solution:

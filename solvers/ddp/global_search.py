@@ -112,7 +112,7 @@ class GlobalDDP:
                               progress=progress)
 
 
-def global_ddp(ocp: OCP, intervals: int, seed: int, substeps: int | None = None,
+def global_ddp(ocp: OCP, intervals: int | None, seed: int, substeps: int | None = None,
                integrator: str | None = None) -> GlobalDDP:
     """DDP from everywhere, as the command line makes it."""
     return GlobalDDP(DDP(ocp, intervals=intervals, substeps=substeps, integrator=integrator), seed=seed)

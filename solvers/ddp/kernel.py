@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from nocl.definition.functions import Stage
 from nocl.definition.ocp import OCP
 from nocl.definition.scales import units, usual_sizes
-from nocl.definition.substeps import RADAU, RK4
+from nocl.definition.substeps import MAP, RADAU, RK4
 from nocl.solvers.ddp.constraints import ConstraintRows, rows_source
 from nocl.support.checks import Array
 from nocl.translate import radau
@@ -22,9 +22,8 @@ from nocl.translate.kernels import emit
 STRAIGHT = 5_000  # products in the chain rule through a step, up to which it is straight-line code
 ACTIVATION_KINDS = {"sine": 0, "tanh": 1, "relu": 2, "silu": 3}  # as csrc/mlp.h numbers them
 Columns = list[ca.SX]
-_STEP = """#define NZ (N + M)
-static const double reach[4] = {0, 0.5, 0.5, 1}, share[4] = {1. / 6, 1. / 3, 1. / 3, 1. / 6};
-"""
+Tableau = tuple[tuple[float, ...], tuple[float, ...]]  # of an explicit step: where its stages are, and their shares
+TABLEAUS: dict[str, Tableau] = {RK4: ((0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)), MAP: ((0.0,), (1.0,))}
 
 
 def pack_weights(net: Any) -> Array:
@@ -58,18 +57,25 @@ def ddp_source(ocp: OCP, net: Any = None, substeps: int = 1, rows: ConstraintRow
     lines = ['#include "lanes.h"', *(['#include "mlp.h"'] if nets else []),
              *(f"#define {name} {value}" for name, value in sizes.items()),
              f"static const double DAMPED[M] = {{{', '.join(map(repr, damped(ocp).tolist()))}}};",
-             _radau(ocp) if integrator == RADAU else _STEP,
+             _radau(ocp) if integrator == RADAU else _explicit(TABLEAUS[integrator]),
              _networks(inputs, nets),
              emit("field", [*moment, networks], [ca.densify(stage.rhs)]),
              emit("stage_jacobian", [*moment, networks], [stage.J.T]),
              emit("network_weights", [*moment, networks, stage.mu], [stage.v]),
              emit("stage_hessian", [*moment, networks, stage.bend, stage.mu], [stage.W]),
-             (_patterns if integrator == RADAU else _chain)(n, m, stage.J.sparsity(), stage.W.sparsity())]
+             _patterns(stage) if integrator == RADAU else _chain(n, m, stage, TABLEAUS[integrator])]
     if ocp.np:
         lines.append(emit("stage_parameters", [*moment, networks, stage.bend, stage.mu], [stage.by_p]))
     held = [] if rows is None else rows_source(ocp, rows, inputs)
     lines += [*_terminal(ocp, inputs), *held, '#include "ddp.h"\n']
     return "\n".join(lines)
+
+
+def _explicit(tableau: Tableau) -> str:
+    """An explicit step, as csrc/ddp.h reads it."""
+    reach, share = (_numbers(f"{name}[{len(values)}]", np.array(values))
+                    for name, values in zip(("reach", "share"), tableau, strict=True))
+    return "\n".join(["#define NZ (N + M)", f"#define PARTS {len(tableau[0])}", reach, share, ""])
 
 
 def _radau(ocp: OCP) -> str:
@@ -169,12 +175,13 @@ class _Derivatives:
         self.by_p = ca.densify(by_p + sum(n.by_p for n in self.nets))
 
 
-def _chain(n: int, m: int, J: ca.Sparsity, W: ca.Sparsity) -> str:
+def _chain(n: int, m: int, stage: _Derivatives, tableau: Tableau) -> str:
     """stage_adjoints() and step_derivatives(): straight-line code while that is small, else loops over sparse rows."""
+    J, W = stage.J.sparsity(), stage.W.sparsity()
     S = _closure(n, m, J)
     JS, WS = (_dense(p).astype(int) @ S.astype(int) for p in (J, ca.Sparsity.unite(W, W.T)))
     terms = 3 * int(JS.sum() + WS.sum() + S.sum(axis=1) @ (WS > 0).sum(axis=1) / 2)  # the first stage has S = 1
-    return "\n".join(_straight_chain(n, m, J, W)) if terms <= STRAIGHT else _looped_chain(n, m, J, W, S)
+    return "\n".join(_straight_chain(n, m, J, W, tableau)) if terms <= STRAIGHT else _looped_chain(n, m, J, W, S)
 
 
 def _closure(n: int, m: int, J: ca.Sparsity) -> NDArray[np.bool_]:
@@ -194,10 +201,10 @@ def _dense(pattern: ca.Sparsity) -> NDArray[np.bool_]:
     return dense
 
 
-def _patterns(n: int, m: int, J: ca.Sparsity, W: ca.Sparsity) -> str:
+def _patterns(stage: _Derivatives) -> str:
     """The tables that csrc/radau.h reads."""
-    whole, at = _whole(W)
-    return "\n".join([*_rows_of("J", _dense(J)), *_rows_of("W", whole), at, ""])
+    whole, at = _whole(stage.W.sparsity())
+    return "\n".join([*_rows_of("J", _dense(stage.J.sparsity())), *_rows_of("W", whole), at, ""])
 
 
 def _whole(W: ca.Sparsity) -> tuple[NDArray[np.bool_], str]:
@@ -227,29 +234,29 @@ def _table(name: str, values: NDArray[np.int64]) -> str:
     return f"static const int {name}[] = {{{', '.join(map(str, values.tolist() or [0]))}}};"
 
 
-def _straight_chain(n: int, m: int, J_pattern: ca.Sparsity, W_pattern: ca.Sparsity) -> list[str]:
-    """The chain rule through one RK4 step, with the stages' Jacobians and Hessians as symbols (see csrc/ddp.h)."""
+def _straight_chain(n: int, m: int, J_pattern: ca.Sparsity, W_pattern: ca.Sparsity, tableau: Tableau) -> list[str]:
+    """The chain rule through one explicit step, with the stages' Jacobians and Hessians as symbols (see csrc/ddp.h)."""
     nz, nj, nw = n + m, J_pattern.nnz(), W_pattern.nnz()
-    reach, share = (0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)
-    h, lam = ca.SX.sym("h"), ca.SX.sym("lam", n)
-    Js, Ws = ca.SX.sym("J", 4 * nj), ca.SX.sym("W", 4 * nw)
-    J = [ca.SX(J_pattern.T, Js[i * nj:(i + 1) * nj]).T for i in range(4)]
-    W = [ca.tril2symm(ca.SX(W_pattern, Ws[i * nw:(i + 1) * nw])) for i in range(4)]
-    mu = [ca.SX()] * 4
-    for i in reversed(range(4)):
-        through = 0 if i == 3 else reach[i + 1] * h * (J[i + 1][:, :n].T @ mu[i + 1])
+    reach, share = tableau
+    last = len(reach) - 1
+    h, lam, stages = ca.SX.sym("h"), ca.SX.sym("lam", n), range(last + 1)
+    Js, Ws = ca.SX.sym("J", len(reach) * nj), ca.SX.sym("W", len(reach) * nw)
+    J = [ca.SX(J_pattern.T, Js[i * nj:(i + 1) * nj]).T for i in stages]
+    W = [ca.tril2symm(ca.SX(W_pattern, Ws[i * nw:(i + 1) * nw])) for i in stages]
+    mu = [ca.SX()] * len(reach)
+    for i in reversed(stages):
+        through = 0 if i == last else reach[i + 1] * h * (J[i + 1][:, :n].T @ mu[i + 1])
         mu[i] = ca.vertcat(h * share[i] * lam + through, h * share[i])
     identity = ca.SX.eye(nz)
     S, F, cost, H = identity, identity[:n, :], ca.SX(1, nz), ca.SX(nz, nz)
-    for i in range(4):
+    for i in stages:
         slope = J[i][:n, :] @ S
         F += h * share[i] * slope
         cost += h * share[i] * (J[i][n, :] @ S)
         H += S.T @ W[i] @ S
-        if i < 3:
+        if i < last:
             S = identity + reach[i + 1] * h * ca.vertcat(slope, ca.SX(m, nz))
-    J_in = [Js[i * nj:(i + 1) * nj] for i in (1, 2, 3)]
-    return [emit("stage_adjoints", [*J_in, lam, h], [ca.densify(ca.vertcat(*mu))]),
+    return [emit("stage_adjoints", [Js, lam, h], [ca.densify(ca.vertcat(*mu))]),
             emit("step_derivatives", [Js, Ws, h], [ca.densify(F.T), ca.densify(cost), ca.densify(H)])]
 
 

@@ -20,16 +20,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from nocl.data import Solution
+from nocl.definition import discrete
 from nocl.definition.constraints import TOLERANCE
 from nocl.definition.functions import Functions
 from nocl.definition.ocp import OCP
 from nocl.definition.substeps import COARSE, INTEGRATORS, RK4, Grid, Steps, settled
 from nocl.solvers.between import EXCHANGES, MOST, SAME, Dips
 from nocl.solvers.ddp.augmented import Augmented
-from nocl.solvers.ddp.batch import Job, Piece, assembled, pieces
+from nocl.solvers.ddp.batch import Job, Piece, assembled, by_length, of_lengths, pieces, stretched
 from nocl.solvers.ddp.constraints import ConstraintRows, rows_of
 from nocl.solvers.ddp.free import FreeTime, lifted, with_horizons
 from nocl.solvers.ddp.kernel import ddp_source, pack_weights
@@ -57,8 +58,8 @@ class DDP:
     Parameters
     ----------
     ocp : OCP
-    intervals : int
-        K, the number of held controls on [t0, T].
+    intervals : int, optional
+        K, the number of held controls on [t0, T]. Default: 80; in discrete time one a step, and no other number.
     substeps : int, optional
         Steps in each interval. Default: 1, or where a few solutions from the OCP's initial states show that this is
         too coarse for the plant, as many as they ask for (nocl/definition/substeps.py); a warning says so.
@@ -87,15 +88,17 @@ class DDP:
     (nocl/solvers/ddp/smoothing.py) where the horizon is a number; costs are those of the problem without it.
     """
 
-    def __init__(self, ocp: OCP, *, intervals: int = 80, substeps: int | None = None, integrator: str | None = None,
-                 dynamics: LearnedDynamics | None = None, settings: DDPSettings | None = None,
-                 constraints: str = "hard", between: bool | None = None, threads: int | None = None,
-                 cache: str | os.PathLike[str] | None = None, rows: ConstraintRows | None = None) -> None:
-        checks.problem(ocp, "DDP")
-        for name, value in (("intervals", intervals), ("substeps", 1 if substeps is None else substeps),
-                            ("threads", 1 if threads is None else threads)):
-            checks.whole(value, name, "DDP", 1)
-        if integrator is not None:
+    def __init__(self, ocp: OCP, *, intervals: int | None = None, substeps: int | None = None,
+                 integrator: str | None = None, dynamics: LearnedDynamics | None = None,
+                 settings: DDPSettings | None = None, constraints: str = "hard", between: bool | None = None,
+                 threads: int | None = None, cache: str | os.PathLike[str] | None = None,
+                 rows: ConstraintRows | None = None) -> None:
+        checks.problem(ocp, "DDP", discrete=True)
+        for name, value in (("intervals", intervals), ("substeps", substeps), ("threads", threads)):
+            checks.whole(1 if value is None else value, name, "DDP", 1)
+        if ocp.system.is_discrete:
+            _check_steps(ocp, substeps, integrator, between, dynamics)
+        elif integrator is not None:
             checks.word(integrator, INTEGRATORS, "integrator", "DDP")
         checks.word(constraints, ("hard", "elastic", "soft"), "constraints", "DDP")
         if constraints == "soft":
@@ -104,7 +107,8 @@ class DDP:
             ocp.refuse_free("DDP on learned dynamics")
         if settings is not None:
             checks.instance(DDPSettings, settings, "settings", "DDP", "DDPSettings(max_iterations=...)")
-        self.ocp, self.intervals, self.settings = ocp, int(intervals), settings or DDPSettings()
+        self.ocp, self.settings = ocp, settings or DDPSettings()
+        self.intervals = discrete.intervals_of(ocp, intervals, "DDP")
         self.smoothed = bool(ocp.flat_controls) and not ocp.is_free
         self.posed = _posed(ocp, self.smoothed)  # what the kernel solves
         self.constraints, self.dynamics, self.cache = constraints, dynamics, cache
@@ -117,7 +121,7 @@ class DDP:
         net = None if dynamics is None else _fitting(ocp, dynamics)
         self._weights = np.zeros(1) if net is None else pack_weights(net)
         self.integrator, self.substeps = \
-            Steps(integrator or RK4, int(substeps)) if substeps else \
+            Steps(integrator or RK4, int(substeps)) if substeps and not ocp.system.is_discrete else \
             steps_for(ocp, dynamics, self.intervals, COARSE, integrator)
         self._own_rows = rows is not None
         given = rows_of(self.posed) if rows is None else rows
@@ -170,7 +174,7 @@ class DDP:
         Parameters
         ----------
         x0 : [nx] or [B, nx]
-        t0 : number or [B], each < horizon; 0 where that is free
+        t0 : number or [B], each < horizon; 0 where that is free; in discrete time samples, whole numbers of dt
         t : nodes [B, K+1] of the guess, whose last one says its horizon; where that is free, default: a middling one
         p : parameters, where the problem has them: [np] for all, [B, np], or by name (OCP.parameters_of)
         curvature : whether to return V_xx
@@ -180,7 +184,8 @@ class DDP:
 
         Raises ValueError before any work for wrong shapes, x0 that is not finite and t0 outside [0, horizon). A problem
         whose guess blows up, or that finds no minimum, has success False, cost inf and a message; the others go on.
-        Rows do not depend on each other, nor on `workers`.
+        Rows do not depend on each other, nor on `workers`. In discrete time a row that starts later has fewer steps:
+        its last node stands until K, at the time T, under its last control.
         """
         rows, _ = checks.states(x0, self.ocp.system.nx, self.ocp.system.name)
         rows = np.ascontiguousarray(rows)
@@ -208,7 +213,29 @@ class DDP:
         return followed(self.ocp, functions, solution, self.substeps, self.integrator, soft) if lost else solution
 
     def descend(self, batch: Piece) -> Solution:
-        """Solve one piece of a batch, here."""
+        """Solve one piece of a batch, here; in discrete time each problem on as many intervals as it has steps."""
+        if not self.ocp.system.is_discrete:
+            return self._solved(batch)
+        left = self.intervals_from(batch.t0)
+        return by_length(batch, self.intervals, left, lambda n, part: self.lasting(n)._solved(part))
+
+    def intervals_from(self, t0: Array) -> NDArray[np.int64]:
+        """[B], how many intervals there are from t0 [B] on: in discrete time the steps that are left."""
+        dt = self.ocp.system.dt
+        done = np.zeros(len(t0)) if dt is None else np.round(t0 / dt)
+        return self.intervals - done.astype(np.int64)
+
+    def lasting(self, n: int) -> DDP:
+        """The same solver, by the same kernel, of problems with n intervals."""
+        if n == self.intervals:
+            return self
+        other = self._with_threads(self.threads)
+        other.intervals, other.held = n, self.rows.count(n)
+        other.__dict__.pop("key", None)  # it is another solver
+        return other
+
+    def _solved(self, batch: Piece) -> Solution:
+        """A piece solved on this solver's intervals."""
         if self.smoothed:
             found = continued(self._descended, batch, self.weights)
             return in_own_cost(self.ocp, self.posed, found, self.weights[-1])
@@ -231,16 +258,19 @@ class DDP:
         brief.settings = replace(self.settings, max_iterations=iterations)
         cost, controls = np.empty(len(x0)), np.empty((len(x0), self.intervals, self.ocp.system.nu))
         for batch in pieces(brief, x0, self._start_times(t0, len(x0)), self._guesses(len(x0), **guess), False, p):
-            work = brief._work(batch.x0, batch.t0, batch.guess, batch.p)
-            work.most[:] = iterations
-            work.descend()
-            here = slice(batch.first, batch.first + batch.size)
-            cost[here], controls[here] = work.promise(), work.u
+            for n, rows, part in of_lengths(batch, self.intervals_from(batch.t0)):
+                work = brief.lasting(n)._work(part.x0, part.t0, part.guess, part.p)
+                work.most[:] = iterations
+                work.descend()
+                here = batch.first + rows
+                cost[here], controls[here] = work.promise(), stretched(work.u, self.intervals)
         return cost, controls
 
     def as_best_known(self) -> DDP:
         """The same solver, which holds hard constraints between nodes too, unless it was said whether it does."""
         if self.between is not None or self.constraints != "hard" or self.rows.stage.equal.all():
+            return self
+        if self.ocp.system.is_discrete:
             return self
         other = self._with_threads(self.threads)
         other.between = True
@@ -364,7 +394,10 @@ class DDP:
         bad = np.flatnonzero(~((times >= 0) & (times < self.ocp.horizon)))
         if bad.size:
             raise ValueError(f"t0[{bad[0]}] is {times[bad[0]]}; expected 0 <= t0 < horizon = {self.ocp.horizon}")
-        return times
+        if self.ocp.steps is None:
+            return times
+        first = np.array([discrete.first_step(self.ocp, t, "DDP") for t in times], dtype=np.int64)
+        return discrete.samples(self.ocp.system, 0, self.ocp.steps)[first]
 
 
     def _free_start_times(self, times: Array) -> Array:
@@ -372,6 +405,17 @@ class DDP:
             raise ValueError(f"t0 is {checks.shown(times)}, but the horizon is free; expected 0: the time that is left "
                              "is found from there")
         return times
+
+
+def _check_steps(ocp: OCP, substeps: int | None, integrator: str | None, between: bool | None,
+                 dynamics: LearnedDynamics | None) -> None:
+    """ValueError for what is about continuous time, on a system in discrete time."""
+    discrete.check_steps(ocp.system, substeps, integrator, "DDP")
+    if between:
+        raise ValueError(f"DDP: between is True, and {ocp.system.name!r} is a system in discrete time, where nothing "
+                         "is between two nodes; expected none: leave it out, constraints hold at every sample")
+    if dynamics is not None:
+        ocp.system.refuse_discrete("DDP on learned dynamics")
 
 
 def _posed(ocp: OCP, smoothed: bool) -> OCP:
@@ -393,6 +437,8 @@ def steps_for(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int, tolera
 
     integrator : of these steps alone; None: RK4, or implicit ones where it would take many of those
     """
+    if ocp.system.is_discrete:
+        return discrete.check_steps(ocp.system, None, integrator, "DDP")
     free = ocp.is_free  # without its constraints a horizon would be as short as it may be
     tried = ocp if ocp.states_only or free else ocp.unconstrained  # a few descents, to see how fast the plant is
     functions, (x0, p) = _functions(tried, dynamics), firsts(ocp)

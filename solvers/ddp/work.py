@@ -16,7 +16,7 @@ from nocl.data import Solution
 from nocl.definition import measured
 from nocl.definition.ocp import OCP
 from nocl.definition.scales import usual_sizes
-from nocl.definition.substeps import RADAU, RK4
+from nocl.definition.substeps import MAP, RADAU, RK4
 from nocl.solvers.ddp.batch import Rows
 from nocl.solvers.ddp.constraints import ConstraintRows
 from nocl.solvers.ddp.without_compiler import NumpyKernel
@@ -26,7 +26,8 @@ from nocl.translate import radau
 from nocl.translate.kernels import Kernel
 
 ROUNDING = 1e-15  # of the usual cost
-STAGES = {RK4: 4, RADAU: radau.STAGES}  # of a step: evaluations of f, in an implicit one for each Newton iteration
+# of a step: evaluations of f, in an implicit one for each Newton iteration
+STAGES = {MAP: 1, RK4: 4, RADAU: radau.STAGES}
 GROWTH, DECAY = 4.0, 2.0  # of mu, after a failure and a success: against 8 and 8, twice as many wild starts converge
 
 
@@ -88,7 +89,7 @@ class Work:
         ocp, B, K = self.ddp.posed, len(self.x0), self.ddp.intervals
         nx, nu = ocp.system.nx, ocp.system.nu
         self.p = np.zeros((B, 0)) if self.parameters is None else self.parameters
-        self.h = (ocp.horizon - self.t0) / K
+        self.h = (ocp.horizon - self.t0) / K if ocp.system.dt is None else np.full(B, ocp.system.dt)
         self.x, self.u = np.zeros((B, K + 1, nx)), np.zeros((B, K, nu))
         self.k, self.gain = np.zeros((B, K, nu)), np.zeros((B, K, nu, nx))
         self.new_x, self.new_u = np.zeros_like(self.x), np.zeros_like(self.u)

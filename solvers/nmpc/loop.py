@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nocl.data import Solution, Trajectory
+from nocl.definition import discrete
 from nocl.definition.ocp import OCP
 from nocl.support import checks
 from nocl.support.checks import Array
@@ -38,7 +39,8 @@ class Loop:
     one, at most to T. Receding: it is as long at each t as at t = 0, and charges G, or the terminal cost, at its own
     end. The first interval of a plan is as long as the control will be held, `hold` times in T; the rest of it is cut
     into N - 1 equal ones. A call at an earlier time than the last, at the same time from other states, or with another
-    number of states starts afresh from all starts.
+    number of states starts afresh from all starts. In discrete time a plan has the samples from t on, and a control is
+    held for one.
 
     `stats` has an entry a call: t; and [B] success, seconds, iterations, cost, message, and source of the control:
     "solved", or where the solve failed (after one more try, from all starts) "last plan", held on, or "u*" where there
@@ -48,11 +50,14 @@ class Loop:
     def __init__(self, nmpc: Planner, hold: int | None = None, receding: bool = False) -> None:
         if hold is not None:
             checks.whole(hold, "hold, how many controls the horizon has,", "NMPC.controller", 1)
+        if nmpc.ocp.system.is_discrete and hold not in (None, nmpc.ocp.steps):
+            raise ValueError(f"NMPC.controller: hold is {hold}, and {nmpc.ocp.system.name!r} is a system in discrete "
+                             f"time; expected {nmpc.ocp.steps}, a control for each step: leave it out")
         receding = checks.flag(receding, "receding", "NMPC.controller")
         if receding and nmpc.ocp.uses_time:
             raise ValueError("a receding window begins at t = 0 anew at each call, but the problem holds the time t; "
                              "expected one without, or receding=False")
-        self.nmpc, self.hold, self.receding = nmpc, hold or nmpc.intervals, receding
+        self.nmpc, self.hold, self.receding = nmpc, hold or nmpc.ocp.steps or nmpc.intervals, receding
         self.plan: Solution | None = None
         self.begin = 0.0  # the time of the plan's first node
         self.asked: Array | None = None  # the states of the last call
@@ -89,10 +94,19 @@ class Loop:
     def nodes(self, t: float) -> Array:
         """t, t + the time that a control is held, ..., the end of the plan [N+1]; from 0 where receding."""
         T, N = self.nmpc.ocp.horizon, self.nmpc.intervals
+        if self.nmpc.ocp.system.is_discrete:
+            return self._samples(t)
         t = 0.0 if self.receding else min(t, T * (1 - NEAR_END))  # some ask at the end, too
         end = min(t + self.nmpc.window, T)
         first = min(T / self.hold, LAST * (end - t))
         return np.r_[t, np.linspace(t + first, end, N)]
+
+    def _samples(self, t: float) -> Array:
+        """The samples from t to the end of the plan; from 0 where receding, and the last step's at the end."""
+        system, window = self.nmpc.ocp.system, self.nmpc.window
+        steps, n = (discrete.steps_in(system, time, "horizon", "NMPC") for time in (self.nmpc.ocp.horizon, window))
+        first = 0 if self.receding else min(discrete.steps_in(system, t, "t", "NMPC as feedback"), steps - 1)
+        return discrete.samples(system, first, min(first + n, steps))
 
     def _guess(self, x: Array, nodes: Array, t: float) -> tuple[Array, Array]:
         """The last plan, shifted; else x held under u*."""

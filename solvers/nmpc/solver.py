@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from nocl.data import Solution, Trajectory
+from nocl.definition import discrete
 from nocl.definition.ocp import OCP
 from nocl.definition.substeps import INTEGRATORS, RADAU, RK4, Grid, Steps, settled
 from nocl.judge.laws import check_made_for, dynamics_function
@@ -42,12 +43,13 @@ PROBES = 3  # states on which more substeps are tried where nothing was solved
 
 @dataclass(frozen=True, eq=False)
 class NMPC:
-    """min over u_0 ... u_{N-1}, held, of the OCP's cost under RK4 steps, for each initial state.
+    """min over u_0 ... u_{N-1}, held, of the OCP's cost under RK4 steps, or under the steps of a system in discrete
+    time, for each initial state.
 
     Parameters
     ----------
     ocp : OCP
-    intervals : N
+    intervals : N; default: 80, in discrete time one a step, and no other number
     dynamics : casadi.Function (x, u[, t][, p]) -> xdot, or an object with `to_casadi()`; default: the exact f
     solver : "fatrop" (fast) or "ipopt" (reference); another nlpsol of CasADi's by its name
     substeps : steps in each interval; default: 1, or where the first solutions show that this is too coarse for the
@@ -81,7 +83,7 @@ class NMPC:
     """
 
     ocp: OCP
-    intervals: int = 80
+    intervals: Any = None  # an int, once it is made
     dynamics: Any = field(default=None, kw_only=True)
     solver: str = field(default="fatrop", kw_only=True)
     substeps: int | None = field(default=None, kw_only=True)
@@ -100,11 +102,12 @@ class NMPC:
     compiled: bool | str | os.PathLike[str] = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
-        checks.problem(self.ocp, "NMPC")
-        for name, least in (("intervals", 2), ("substeps", 1), ("starts", 1), ("passes", 0), ("neighbours", 1)):
-            if name != "substeps" or self.substeps is not None:
+        checks.problem(self.ocp, "NMPC", discrete=True)
+        fewest = 1 if self.ocp.system.is_discrete else 2
+        for name, least in (("intervals", fewest), ("substeps", 1), ("starts", 1), ("passes", 0), ("neighbours", 1)):
+            if name not in ("intervals", "substeps") or getattr(self, name) is not None:
                 checks.whole(getattr(self, name), name, "NMPC", least)
-        if self.integrator is not None:
+        if self.integrator is not None and not self.ocp.system.is_discrete:
             checks.word(self.integrator, INTEGRATORS, "integrator", "NMPC")
         checks.whole(self.seed, "seed", "NMPC", most=2**63)
         checks.word(self.constraints, ("hard", "soft"), "constraints", "NMPC")
@@ -120,11 +123,24 @@ class NMPC:
             raise ValueError(f"NMPC: options is {checks.shown(self.options)}; expected a dict of options of the "
                              'nlpsol by name, like {"ipopt.tol": 1e-6}')
         self._check_window()
+        self._set_grid()
         if self.time_limit is not None:
             checks.number(self.time_limit, "time_limit", "NMPC", positive=True)
         if self.dynamics is not None:
             object.__setattr__(self, "dynamics", dynamics_function(self.ocp, self.dynamics))
         object.__setattr__(self, "terminal", _terminal(self.ocp, self.terminal))
+
+    def _set_grid(self) -> None:
+        """The intervals, and in discrete time the steps, which are given there."""
+        found: dict[str, Any] = {"intervals": discrete.intervals_of(self.ocp, self.intervals, "NMPC", self.horizon)}
+        if self.ocp.system.is_discrete:
+            steps = discrete.check_steps(self.ocp.system, self.substeps, self.integrator, "NMPC")
+            found |= {"substeps": steps.substeps, "integrator": steps.integrator}
+            if self.between:
+                raise ValueError(f"NMPC: between is True, and {self.ocp.system.name!r} is a system in discrete time, "
+                                 "where nothing is between two nodes; expected False: constraints hold at every sample")
+        for name, value in found.items():
+            object.__setattr__(self, name, value)
 
     def _check_window(self) -> None:
         if self.horizon is not None and self.ocp.is_free:
@@ -225,7 +241,8 @@ class NMPC:
         p : parameters, where the problem has them: [np] for all, [B, np], or by name (OCP.parameters_of)
         guesses : tried first: a Solution or Trajectory nearby (solved with a small barrier: a warm start), controls u
             [B, N, nu], (x [B, N+1, nx], u), a controller (x, t[, p]) -> u whose rollout is meant, or a list of them
-        nodes : times of the nodes [N+1]; default: N equal intervals from t0 to the window's end
+        nodes : times of the nodes [N+1]; default: N equal intervals from t0 to the window's end. In discrete time they
+            are the samples from t0 on, fewer towards the horizon, and so is the plan
         starts : built-in starts for each state; default: self.starts, or none where guesses are given
         gains : also the Solution's `gain` and `V_xx`; where all constraints are inequalities of (x, t, p), none of them
             soft, and the horizon is a number
@@ -243,6 +260,9 @@ class NMPC:
         Raises ValueError before any solve where shapes do not fit or numbers are not finite.
         """
         s = self.ocp.system
+        if s.is_discrete and len(t := self._samples(t0, nodes)) != self.intervals + 1:
+            return self._lasting(len(t) - 1).solve(x0, guesses, p=p, nodes=t, starts=starts, gains=gains,
+                                                   workers=workers, out=out, progress=progress)
         rows, _ = checks.states(x0, s.nx, s.name)
         if not len(rows):
             raise ValueError(f"x0 has shape {np.shape(x0)}; expected at least one state")
@@ -348,6 +368,8 @@ class NMPC:
     def _nodes(self, t0: float, nodes: ArrayLike | None) -> Array:
         if self.ocp.is_free:
             return self._free_nodes(t0, nodes)
+        if self.ocp.system.is_discrete:
+            return self._samples(t0, nodes)
         T, N = self.ocp.horizon, self.intervals
         t0 = checks.start_time(t0, T)
         t = np.linspace(t0, min(t0 + self.window, T), N + 1) if nodes is None else \
@@ -357,6 +379,25 @@ class NMPC:
         if self.horizon is None and t[-1] < T * (1 - 1e-9):
             raise ValueError(f"nodes end at {t[-1]:g}; expected {T:g}, the horizon: give NMPC a shorter `horizon`")
         return t
+
+    def _samples(self, t0: float, nodes: ArrayLike | None) -> Array:
+        """The samples of a plan in discrete time, from t0, or the first of the nodes, to the window's end."""
+        system, T = self.ocp.system, self.ocp.horizon
+        given = None if nodes is None else np.atleast_1d(checks.numeric(nodes, "nodes", "NMPC.solve", "times [N+1]"))
+        begin = checks.start_time(t0 if given is None or not given.size else float(given[0]), T)
+        first = discrete.first_step(self.ocp, begin, "NMPC.solve")
+        steps, n = (discrete.steps_in(system, time, "horizon", "NMPC.solve") for time in (T, self.window))
+        t = discrete.samples(system, first, min(first + n, steps))
+        if given is not None and not (given.shape == t.shape and np.allclose(given, t, rtol=0, atol=1e-9 * T)):
+            raise ValueError(f"nodes are {checks.shown(nodes)}; expected the samples of {system.name!r} from {t[0]:g} "
+                             f"to {t[-1]:g}, one a step: leave them out, and give t0")
+        return t
+
+    def _lasting(self, n: int) -> NMPC:
+        """The same one for plans of n intervals: in discrete time towards the end of the horizon."""
+        other = replace(self)
+        object.__setattr__(other, "intervals", n)
+        return other
 
     def _free_nodes(self, t0: float, nodes: ArrayLike | None) -> Array:
         """Equal intervals, as long as a middling horizon makes them."""
@@ -380,7 +421,7 @@ def _known(solver: str) -> bool:
         return False
 
 
-def closed_loop(ocp: OCP, intervals: int, seed: int, substeps: int | None = None,
+def closed_loop(ocp: OCP, intervals: int | None, seed: int, substeps: int | None = None,
                 integrator: str | None = None) -> Loop:
     """NMPC as feedback, as the command line makes it."""
     return NMPC(ocp, intervals, seed=seed, substeps=substeps, integrator=integrator).controller()
@@ -528,15 +569,19 @@ class _States:
         p, between = self.nmpc.program, np.full((*found.u.shape[:2], 4, 2 * found.x.shape[2]), np.nan)
         message = [why or found.message[i] + outside(p, self.x0[i]) for i, why in enumerate(self.refusal)]
         slack = np.full((*found.x.shape[:2], len(self.nmpc.soft)), np.nan)
+        in_steps = self.nmpc.ocp.system.is_discrete  # then there is nothing between two nodes
         for i in range(len(self.x0)):
             row = (found.t[i], found.x[i], found.u[i])
             if found.success[i]:
                 own = self._own(i)
-                found.V[i], between[i] = cost_to_go(p, *row, own), dense(p, *row, found.V_x[i], own)
+                found.V[i] = cost_to_go(p, *row, own)
+                if not in_steps:
+                    between[i] = dense(p, *row, found.V_x[i], own)
                 slack[i] = p.slack(*row, own)
             elif not self.refusal[i]:
                 message[i] = failure(p, self.x0[i], int(found.starts[i]), self.failed[i], self._own(i))
-        return replace(found, message=np.array(message), dense=between, slack=slack if self.nmpc.soft else None)
+        return replace(found, message=np.array(message), dense=None if in_steps else between,
+                       slack=slack if self.nmpc.soft else None)
 
 
 def _is_solution(guess: Any) -> bool:

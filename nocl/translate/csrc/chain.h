@@ -1,20 +1,19 @@
-/* The chain rule through one Runge-Kutta step, looped over sparse rows: for systems where straight-line code would be too much
+/* The chain rule through one explicit step, looped over sparse rows: for systems where straight-line code would be too much
    to compile. Generated before this file: N, NZ, NJ, NW and tables of the patterns, row by row (row r: X_ROW[r] to X_ROW[r+1],
    columns X_COL): J_ of d(xdot, L)/d(x, u), N + 1 rows; W_ of a stage's Hessian, whole, with W_AT the place among its NW
    nonzeros; S_ of d(a stage's state, u)/d(x, u), closed under multiplication by J, with the diagonal; T_ of W S. */
 
 /* mu[j (N+1)], what weights stage j: lam and 1 by its share in the step, and what later stages make of it. */
-static void stage_adjoints(const lane *J2, const lane *J3, const lane *J4, const lane *lam, const lane *h, lane *mu)
+static void stage_adjoints(const lane *J, const lane *lam, const lane *h, lane *mu)
 {
-    const lane *J[4] = {0, J2, J3, J4};
-    for (int j = 3; j >= 0; --j) {
+    for (int j = PARTS - 1; j >= 0; --j) {
         lane *now = mu + j * (N + 1);
         for (int i = 0; i <= N; ++i) now[i] = share[j] * *h * (i < N ? lam[i] : splat(1));
-        if (j < 3)
+        if (j < PARTS - 1)
             for (int r = 0; r <= N; ++r) {
                 const lane later = reach[j + 1] * *h * now[N + 1 + r];
                 for (int p = J_ROW[r]; p < J_ROW[r + 1]; ++p)
-                    if (J_COL[p] < N) now[J_COL[p]] += J[j + 1][p] * later;
+                    if (J_COL[p] < N) now[J_COL[p]] += J[(j + 1) * NJ + p] * later;
             }
     }
 }
@@ -46,7 +45,7 @@ static void step_derivatives(const lane *J, const lane *W, const lane *h, lane *
         l[i] = (lane){0};
         for (int q = S_ROW[i]; q < S_ROW[i + 1]; ++q) S[q] = next[q] = splat(S_COL[q] == i);
     }
-    for (int j = 0; j < 4; ++j, J += NJ, W += NW) {
+    for (int j = 0; j < PARTS; ++j, J += NJ, W += NW) {
         congruence(W, S, H);
         for (int r = 0; r <= N; ++r) {
             lane row[NZ];
@@ -59,7 +58,7 @@ static void step_derivatives(const lane *J, const lane *W, const lane *h, lane *
                 for (int q = S_ROW[r]; q < S_ROW[r + 1]; ++q) {
                     const int c = S_COL[q];
                     F[r * NZ + c] += share[j] * *h * row[c];
-                    if (j < 3) next[q] = splat(c == r) + reach[j + 1] * *h * row[c];
+                    if (j < PARTS - 1) next[q] = splat(c == r) + reach[j + 1] * *h * row[c];
                 }
         }
         for (int q = 0; q < S_ROW_END; ++q) S[q] = next[q];

@@ -9,7 +9,7 @@
    field(x, u, net, out)                      out[N+1]: xdot, L; reads only the networks' values
    stage_jacobian(x, u, net, J)               nonzeros of d(xdot, L)/d(x, u), row by row
    stage_hessian(x, u, net, bend, mu, W)      nonzeros of the Hessian of mu'(xdot, L)
-   stage_adjoints(J2, J3, J4, lam, h, mu)     mu[4 (N+1)], what weights the four stages of a Runge-Kutta step
+   stage_adjoints(J, lam, h, mu)              mu[PARTS (N+1)], what weights the PARTS stages of an explicit step
    step_derivatives(J, W, h, F, l, H)         F[N NZ] = dx+/dz, l[NZ] = dcost/dz, H[NZ NZ] the Hessian of lam'x+ + cost
                                               (only its lower triangle is read); these two may stand in chain.h
    terminal(x, G, Gx, Gxx)
@@ -78,12 +78,12 @@ static void later(const lane *d, lane time, lane *now)
 #ifdef STAGES
 #include "radau.h"
 #else
-/* One Runge-Kutta step, x to next; returns its cost. */
+/* One explicit step, x to next; returns its cost. */
 static lane step(const double *weights, const lane *x, const lane *u, DATA_IN lane h, lane *next)
 {
     lane s[N], k[N + 1], net[NET + 1], cost = {0};
     for (int i = 0; i < N; ++i) next[i] = x[i];
-    for (int j = 0; j < 4; ++j) {
+    for (int j = 0; j < PARTS; ++j) {
         for (int i = 0; i < N; ++i) s[i] = j ? x[i] + reach[j] * h * k[i] : x[i];
         LATER(d, reach[j] * h, now)
         network_values(weights, s, u, NOW net);
@@ -94,13 +94,13 @@ static lane step(const double *weights, const lane *x, const lane *u, DATA_IN la
     return cost;
 }
 
-/* The derivatives of one Runge-Kutta step from x, second ones along lam (see step_derivatives); returns its cost. */
+/* The derivatives of one explicit step from x, second ones along lam (see step_derivatives); returns its cost. */
 static lane derivatives(const double *weights, const lane *x, const lane *u, DATA_IN const lane *lam, lane h,
                         lane *F, lane *l, lane *H BY_P_IN)
 {
-    lane s[4][N], k[N + 1], net[4][NET + 1], tape[4][TAPE + 1], v[NV + 1], bend[BEND + 1];
-    lane J[4 * NJ + 1], W[4 * NW + 1], mu[4 * (N + 1)], cost = {0};
-    for (int j = 0; j < 4; ++j) {
+    lane s[PARTS][N], k[N + 1], net[PARTS][NET + 1], tape[PARTS][TAPE + 1], v[NV + 1], bend[BEND + 1];
+    lane J[PARTS * NJ + 1], W[PARTS * NW + 1], mu[PARTS * (N + 1)], cost = {0};
+    for (int j = 0; j < PARTS; ++j) {
         for (int i = 0; i < N; ++i) s[j][i] = j ? x[i] + reach[j] * h * k[i] : x[i];
         LATER(d, reach[j] * h, now)
         network_slopes(weights, s[j], u, NOW net[j], tape[j]);
@@ -108,8 +108,8 @@ static lane derivatives(const double *weights, const lane *x, const lane *u, DAT
         cost += share[j] * h * k[N];
         stage_jacobian(s[j], u, NOW net[j], J + j * NJ);
     }
-    stage_adjoints(J + NJ, J + 2 * NJ, J + 3 * NJ, lam, &h, mu);
-    for (int j = 0; j < 4; ++j) {
+    stage_adjoints(J, lam, &h, mu);
+    for (int j = 0; j < PARTS; ++j) {
         LATER(d, reach[j] * h, now)
         network_weights(s[j], u, NOW net[j], mu + j * (N + 1), v);
         network_bend(weights, v, tape[j], bend);

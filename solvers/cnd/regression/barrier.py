@@ -66,9 +66,9 @@ def guarded(ocp: OCP) -> NDArray[np.bool_]:
 
 
 def _rows(ocp: OCP) -> list[tuple[int, Moved]]:
-    """Such rows by number; none where the equations of motion are not known."""
+    """Such rows by number; none where the equations of motion are not known, and in discrete time."""
     rows = ocp.functions.rows
-    if ocp.system.xdot is None:
+    if ocp.system.xdot is None or ocp.system.is_discrete:
         return []
     moved = [(int(i), _moved(ocp, int(i))) for i in np.flatnonzero(~rows.of_u & ~rows.equal)]
     return [(i, row) for i, row in moved if row is not None]

@@ -12,7 +12,7 @@ from nocl.definition.ocp import OCP
 from nocl.definition.substeps import RADAU, RK4
 from nocl.solvers.cnd.regression.implicit import Implicit
 from nocl.support.checks import Array
-from nocl.translate.rk4 import rk4_cost
+from nocl.translate.rk4 import map_cost, rk4_cost
 from nocl.translate.torch_functions import to_torch
 
 Function = Callable[..., Tensor]
@@ -76,14 +76,19 @@ class Rows:
         return Rows(self.of, self._p.repeat_interleave(n, dim=0))
 
     def interval(self, x: Tensor, u: Tensor, t: Any, h: Any, substeps: int = 1) -> tuple[Tensor, Tensor]:
-        """(the states after intervals of length h from t on with u held, the integral of L over them)."""
+        """(the states after intervals of length h from t on with u held, the integral of L over them); in discrete time
+        after a step, where h is dt, and where they are, where h is 0."""
         if self.of.implicit is not None:
             return self.of.implicit.interval(self, x, u, t, h, substeps)
+        if self.of.ocp.system.is_discrete:
+            return map_cost(self.f, self.L, x, u, h, t if self.of.timed else None)
         return rk4_cost(self.f, self.L, x, u, h, substeps, t if self.of.timed else None)
 
     def after(self, x: Tensor, u: Tensor, t: Any, h: Any, substeps: int = 1) -> Tensor:
         """The states alone."""
         if self.of.implicit is not None:
             return self.of.implicit.interval(self, x, u, t, h, substeps)[0]
+        if self.of.ocp.system.is_discrete:
+            return map_cost(self.f, lambda *_: 0.0, x, u, h, t if self.of.timed else None)[0]
         end, _ = rk4_cost(self.f, lambda *_: 0.0, x, u, h, substeps, t if self.of.timed else None)
         return end

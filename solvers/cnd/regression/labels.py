@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from nocl.data import Solution
+from nocl.definition.discrete import samples
 from nocl.definition.ocp import OCP
 from nocl.definition.sampling import Uniform, box
 from nocl.solvers.cnd.regression.in_torch import InTorch
@@ -58,17 +59,22 @@ class Labels:
         K, nu = s.u.shape[1:]
         h = np.repeat(np.diff(s.t[:, :2], axis=1), K)
         cost = np.repeat(np.abs(s.V[:, 0]), K) + SMALL * unit
-        return Labels(s.x[:, :-1].reshape(len(h), -1), s.t[:, :-1].ravel(), np.repeat(s.parameters, K, axis=0),
-                      s.u.reshape(-1, nu), h / cost, h)
+        every = Labels(s.x[:, :-1].reshape(len(h), -1), s.t[:, :-1].ravel(), np.repeat(s.parameters, K, axis=0),
+                       s.u.reshape(-1, nu), h / cost, h)
+        lasts = np.diff(s.t, axis=1).ravel() > 0  # behind the end, in discrete time, nothing does
+        return every if lasts.all() else every[lasts]
 
     @staticmethod
     def of(solution: Solution, torch_ocp: InTorch, unit: float, substeps: int = 1) -> Labels:
         """The same as continuous controls: at the middle of its interval a held one equals them to second order.
 
         f in torch gives the states between nodes, by half of the interval's `substeps`, or one more. Where steps are
-        implicit, what is fast is at rest there: then the starts of solutions are labels too.
+        implicit, what is fast is at rest there: then the starts of solutions are labels too. In discrete time controls
+        stand at the samples where they act.
         """
         start = Labels.held(solution, unit)
+        if torch_ocp.ocp.system.is_discrete:
+            return replace(start, dt=np.zeros(len(start)))
         with torch.no_grad():
             half, t = torch.from_numpy(start.dt / 2)[:, None], torch.from_numpy(start.t)[:, None]
             at = (torch.from_numpy(start.x), torch.from_numpy(start.u), t, half)
@@ -162,7 +168,8 @@ def tube_states(ocp: OCP, bank: SolutionBank, n: int, width: float,
                 rng: np.random.Generator) -> tuple[NDArray[np.int64], Problems]:
     """(rows of the bank, n problems): x = x_row(t0) + width * exp(U(-1.5, 0)) * scale * N(0, I), and p likewise."""
     rows = rng.integers(0, len(bank), n)
-    t0 = rng.uniform(0, 0.97 * ocp.horizon, n)
+    t0 = rng.uniform(0, 0.97 * ocp.horizon, n) if ocp.steps is None else \
+        samples(ocp.system, 0, ocp.steps)[rng.integers(0, ocp.steps, n)]
     x, p = bank.states(rows, t0[:, None])[:, 0], bank.solution.parameters[rows]
     nx = x.shape[1]
     x += width * np.exp(rng.uniform(-1.5, 0, (n, 1))) * bank.scale[:nx] * rng.standard_normal(x.shape)
@@ -226,7 +233,10 @@ def kicked_rollout(torch_ocp: InTorch, policy: Policy, start: Problems, kick: Ar
                    steps: int = 160, kicks: int = 6, substeps: int = 1) -> tuple[Array, Array]:
     """The policy's states (t [steps+1], x [B, steps+1, nx]) from the start, pushed by N(0, kick^2) at `kicks` random
     times."""
-    h, here = torch_ocp.ocp.horizon / steps, torch_ocp.at(start.p)
+    ocp, here = torch_ocp.ocp, torch_ocp.at(start.p)
+    steps = ocp.steps or steps
+    h = ocp.system.dt or ocp.horizon / steps
+    asked = 0.0 if ocp.system.is_discrete else h / 2  # after the start of a step
     x, path = torch.from_numpy(start.x), [start.x]
     times = rng.integers(0, steps, (kicks, len(start)))
     with torch.no_grad():
@@ -234,21 +244,49 @@ def kicked_rollout(torch_ocp: InTorch, policy: Policy, start: Problems, kick: Ar
             push = (times == k).sum(axis=0)[:, None] * kick * rng.standard_normal(start.x.shape)
             x = x + torch.from_numpy(push)
             t = torch.full((len(x), 1), k * h, dtype=x.dtype)
-            x = here.after(x, policy(x, t + h / 2, *here.p), t, h, substeps)
+            x = here.after(x, policy(x, t + asked, *here.p), t, h, substeps)
             path.append(x.numpy())
-    return np.linspace(0, torch_ocp.ocp.horizon, steps + 1), np.stack(path, axis=1)
+    return h * np.arange(steps + 1), np.stack(path, axis=1)
 
 
 def policy_controls(policy: Policy, torch_ocp: InTorch, at: Problems, K: int, substeps: int = 1) -> Array:
     """The controls [B, K, nu] that the policy gives from there, each held over an interval of [t, T]."""
     state, start, here = torch.from_numpy(at.x), torch.from_numpy(at.t)[:, None], torch_ocp.at(at.p)
-    h = (torch_ocp.ocp.horizon - start) / K
-    controls = []
+    controls, asked = [], 0.0 if torch_ocp.ocp.system.is_discrete else 0.5
     with torch.no_grad():
         for k in range(K):
-            controls.append(policy(state, start + (k + 0.5) * h, *here.p))
-            state = here.after(state, controls[-1], start + k * h, h, substeps)
+            t, h = interval(torch_ocp.ocp, start, k, K)
+            controls.append(policy(state, t + asked * h, *here.p))
+            state = here.after(state, controls[-1], t, h, substeps)
     return torch.stack(controls, dim=1).numpy()
+
+
+def interval(ocp: OCP, start: Tensor, k: int, K: int) -> tuple[Tensor, Tensor]:
+    """(when interval k of K from `start` [B, 1] to the end begins, its length); in discrete time steps, and behind the
+    end what lasts no time."""
+    if ocp.system.dt is None:
+        h = (ocp.horizon - start) / K
+        return start + k * h, h
+    t = torch.clamp(start + k * ocp.system.dt, max=ocp.horizon)
+    return t, ocp.system.dt * (t < ocp.horizon - ocp.system.dt / 2).to(t.dtype)
+
+
+def stepped_run(policy: Policy, torch_ocp: InTorch, at: Problems) -> tuple[Array, Array, Array]:
+    """The policy as feedback in discrete time, asked at every sample: J [B], x [B, K+1, nx], t [B, K+1], which stand at
+    the end."""
+    ocp, here, start = torch_ocp.ocp, torch_ocp.at(at.p), torch.from_numpy(at.t)[:, None]
+    assert ocp.steps is not None
+    x, J, K = torch.from_numpy(at.x), torch.zeros_like(start), ocp.steps
+    path, times = [x], [start]
+    with torch.no_grad():
+        for k in range(K):
+            t, h = interval(ocp, start, k, K)
+            x, cost = here.interval(x, policy(x, t, *here.p), t, h)
+            J = J + cost
+            path.append(x)
+            times.append(interval(ocp, start, k + 1, K)[0])
+        J = J + here.G(x)
+    return J[:, 0].numpy(), torch.stack(path, dim=1).numpy(), torch.cat(times, dim=1).numpy()
 
 
 def continuous_cost(policy: Policy, torch_ocp: InTorch, at: Problems, steps: int) -> Array:
@@ -258,8 +296,10 @@ def continuous_cost(policy: Policy, torch_ocp: InTorch, at: Problems, steps: int
 
 def continuous_run(policy: Policy, torch_ocp: InTorch, at: Problems, steps: int) -> tuple[Array, Array, Array]:
     """The policy as continuous feedback from there, by RK4 on (x, t, cost), or implicit steps: J [B],
-    x [B, steps+1, nx], t [B, steps+1].
+    x [B, steps+1, nx], t [B, steps+1]. In discrete time at its own steps.
     """
+    if torch_ocp.ocp.system.is_discrete:
+        return stepped_run(policy, torch_ocp, at)
     n, here, steps_of = at.x.shape[1], torch_ocp.at(at.p), torch_ocp.implicit
 
     def closed_loop(z: Tensor, _: None) -> Tensor:
