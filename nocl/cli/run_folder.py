@@ -130,8 +130,8 @@ class RunFolder:
         except ValueError as error:  # what cannot be solved, training tells with what to do
             say(f"dynamics: not held against each other: {error}")
             return
-        more = "" if loss.median <= OPEN else ": record more where the problem goes, or the controller will be one for " \
-            "this model alone"
+        more = "" if loss.median <= OPEN else \
+            ": record more where the problem goes, or the controller will be one for this model alone"
         say(f"dynamics: that of four fifths, on that of all: {loss}{more}")
 
     def train(self, exact: bool) -> CND:

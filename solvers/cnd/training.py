@@ -57,6 +57,7 @@ from nocl.solvers.cnd.regression.labels import (
     visited,
 )
 from nocl.solvers.cnd.regression.regress import fit_net, policy_loss
+from nocl.solvers.cnd.regression.rolled import Rolled
 from nocl.solvers.cnd.settings import AUTO, TrainSettings, identity
 from nocl.solvers.cnd.stationary import StationaryTraining, check_stationary
 from nocl.solvers.cnd.validate import (
@@ -446,7 +447,7 @@ class Training:
             self.net, self.inverse = policy_net(self.ocp, self.labels[: self.first], self.settings.hidden,
                                                 self.settings.control_dt, self.own, self.settings.branches,
                                                 0.0 if self.learned else self.ocp.longest)
-        self.policy = at_rate(self.net, 0.0) if self.settings.control_dt else self.net  # in continuous time
+        self.policy = Rolled(at_rate(self.net, 0.0) if self.settings.control_dt else self.net)  # in continuous time
 
     def _rehearse_export(self) -> None:
         """Warns, before the long part, where CasADi does not answer as the policy does."""

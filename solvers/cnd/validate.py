@@ -216,13 +216,14 @@ def _value_and_slope(value: FeatureNet, x: Array, t: Array, p: list[Tensor]) -> 
 
 
 def _hjb(value: FeatureNet, policy: Policy, torch_ocp: InTorch, tails: Solution) -> dict[str, float]:
+    """The HJB residual along tails, in units of their mean running cost; where L = 0, of |V| over the horizon."""
     every = slice(0, -1, max(tails.u.shape[1] // NODES, 1))
     x = torch.from_numpy(np.ascontiguousarray(tails.x[:, every].reshape(-1, tails.x.shape[2])))
     t = torch.from_numpy(np.ascontiguousarray(tails.t[:, every].reshape(-1, 1)))
     here = torch_ocp.at(np.repeat(tails.parameters, len(x) // len(tails), axis=0))
     with torch.no_grad():
         u = policy(x, t, *here.p)
-        usual = float(here.L(x, u, t).abs().mean())
+        usual = float(here.L(x, u, t).abs().mean()) or float(value(x, t, *here.p).abs().mean()) / torch_ocp.ocp.horizon
     residual = hjb_residual(lambda x, t: value(x, t, *here.p), lambda x, u: here.f(x, u, t),
                             lambda x, u: here.L(x, u, t), x, u, t).detach().abs().numpy()
     return {"hjb_median": float(np.median(residual)) / usual, "hjb_mean": float(residual.mean()) / usual}

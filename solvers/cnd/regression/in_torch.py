@@ -12,6 +12,7 @@ from nocl.definition.ocp import OCP
 from nocl.definition.substeps import RADAU, RK4
 from nocl.solvers.cnd.regression.implicit import Implicit
 from nocl.support.checks import Array
+from nocl.translate.in_c import InC
 from nocl.translate.rk4 import map_cost, rk4_cost
 from nocl.translate.torch_functions import to_torch
 
@@ -32,7 +33,7 @@ class InTorch:
         self.takes = {"f": names if dynamics is None else ocp.system.arguments.names, "L": names,
                       "G": ocp.functions.end.names}
         self.n_p = {"f": ocp.np if dynamics is None else ocp.system.np, "L": ocp.np, "G": ocp.np}
-        self.function = {"f": dynamics or to_torch(ocp.functions.f), "L": to_torch(ocp.L), "G": to_torch(ocp.G)}
+        self.function = {"f": dynamics or InC(ocp.functions.f), "L": InC(ocp.L), "G": to_torch(ocp.G)}
 
     def at(self, p: Array) -> Rows:
         """The problem for rows with parameters p [B, np]."""
