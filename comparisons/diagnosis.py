@@ -240,8 +240,9 @@ def _solved(ddp: DDP, seed: int) -> Solution:
 def _grid(ddp: DDP, said: list[warnings.WarningMessage]) -> Finding:
     step, fastest = ddp.ocp.longest / ddp.intervals, fastest_at_start(ddp.ocp, ddp.ocp.functions)
     what = "Runge-Kutta" if ddp.integrator == RK4 else "implicit Radau"
-    text = (f"{ddp.substeps} {what} step(s) in each of {ddp.intervals} intervals of {step:.3g}; the fastest time "
-            f"constant where it starts is {fastest:.3g}")
+    mode = f"the fastest time constant where it starts is {fastest:.3g}" if np.isfinite(fastest) else \
+        "nothing decays, grows or swings by itself where it starts"
+    text = f"{ddp.substeps} {what} step(s) in each of {ddp.intervals} intervals of {step:.3g}; {mode}"
     coarse = [str(w.message) for w in said if "too coarse" in str(w.message)]
     if ddp.coarse:
         return Finding("integration", PROBLEM, coarse[-1] if coarse else text)

@@ -61,15 +61,15 @@ def followed(ocp: OCP, functions: Functions, solution: Solution, substeps: int, 
     return replace(solution, message=np.array(message), cost=cost, success=success)
 
 
-def fastest_at_start(ocp: OCP, functions: Functions) -> float:
+def fastest_at_start(ocp: OCP, functions: Functions, number: int = ROWS) -> float:
     """The shortest time constant of f at some initial states under u*."""
-    x, p = firsts(ocp)
-    return fastest(functions, {"x": x, "u": ocp.goals(p)[1], "t": np.zeros(ROWS), "p": p})
+    x, p = firsts(ocp, number)
+    return fastest(functions, {"x": x, "u": ocp.goals(p)[1], "t": np.zeros(number), "p": p})
 
 
-def firsts(ocp: OCP) -> tuple[Array, Array]:
-    """A few initial states [ROWS, nx] and parameters [ROWS, np], always the same."""
-    return ocp.initial_states.sample(ROWS, own_numbers(0)), ocp.sample_parameters(ROWS, own_numbers(0, 2))
+def firsts(ocp: OCP, number: int = ROWS) -> tuple[Array, Array]:
+    """A few initial states [number, nx] and parameters [number, np], always the same."""
+    return ocp.initial_states.sample(number, own_numbers(0)), ocp.sample_parameters(number, own_numbers(0, 2))
 
 
 def _errors(ocp: OCP, functions: Functions, s: Solution, integrator: str, soft: bool) -> Callable[[int], Array]:
@@ -116,9 +116,12 @@ def _stages(s: Solution) -> Stages:
 
 
 def fastest(functions: Functions, at: Stages) -> float:
-    """The shortest time constant of the linearised f at stages x [n, nx], u [n, nu], t [n], p [n, np]; inf for none."""
+    """The shortest time constant of the linearised f at stages x [n, nx], u [n, nu], t [n], p [n, np]; inf for none.
+
+    1 / |lambda|: what swings has one too, which steps have to follow.
+    """
     nx = at["x"].shape[1]
     A = functions.jacobian(*functions.arguments.columns(**at))[0].full()
     A = A.reshape(nx, -1, nx).transpose(1, 0, 2)
-    rate = np.abs(np.linalg.eigvals(A[np.isfinite(A).all(axis=(1, 2))]).real).max(initial=0.0)
+    rate = np.abs(np.linalg.eigvals(A[np.isfinite(A).all(axis=(1, 2))])).max(initial=0.0)
     return float(1 / rate) if rate > 0 else np.inf

@@ -2,7 +2,8 @@
 
 What is left to nocl (substeps=None) begins with one Runge-Kutta step in each interval, and takes more where that is too
 coarse, as many as what it found first asks for; where these are many, or a mode of the system makes RK4 unstable,
-implicit steps (nocl/translate/radau.py), if few of them do.
+implicit steps (nocl/translate/radau.py), if few of them do. Solutions that are found say nothing of initial states from
+which there are none since the state runs away between steps: these are followed under held controls (`enduring`).
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ STABLE = 2.7  # |lambda| h up to which RK4 damps what decays
 COARSE = 1e-2  # a larger error is worth a warning
 FINE = 1e-3  # training takes more substeps above it
 WANTED = 1e-4  # ... and a smaller one is what substeps are chosen for
+STARTS = 64  # initial states that are followed under held controls
+LOST = 0.05  # of those that stay finite with the finest steps, which may blow up: neighbours lead to them
 REMEDY = "more intervals, or an equation for what settles at once in place of its dynamics"
 
 
@@ -135,6 +138,46 @@ def _explicit_or(now: Steps, grid: Grid | None, found: dict[Steps, Grid | None])
     return Steps(RK4, TRIED[-1] if first is None else first.enough)
 
 
+def enduring(owner: str, chosen: Steps, kept: Callable[[Steps], int], stiff: Callable[[], bool],
+             ask: Callable[[Steps], Grid | None], tolerance: float = COARSE, integrator: str | None = None) -> Steps:
+    """Steps, `chosen` or the next dearer ones, with which initial states stay finite that do so with the finest.
+
+    kept : steps -> how many of STARTS initial states stay finite under held controls
+    stiff : whether no explicit steps that are tried can follow f where these begin
+    ask, tolerance, integrator : as in `settled`: solutions that there are only now may ask for more
+    """
+    if kept(chosen) == STARTS:
+        return chosen
+    dearer = _dearer(chosen, integrator, stiff)
+    wanted = (1 - LOST) * kept(dearer[-1])
+    best = next(steps for steps in dearer if kept(steps) >= wanted)
+    if best != chosen:
+        grid = ask(best)
+        best = best if grid is None or grid.error <= tolerance else Steps(best.integrator, grid.enough)
+        warnings.warn(f"{owner}: of {STARTS} initial states under held controls {kept(chosen)} stay finite with "
+                      f"{_words(chosen)} in an interval, {kept(best)} with {_words(best)}; these are taken",
+                      stacklevel=4)
+    return best
+
+
+def _dearer(chosen: Steps, integrator: str | None, stiff: Callable[[], bool]) -> list[Steps]:
+    """`chosen` and what takes longer, in this order."""
+    n = chosen.substeps
+    implicit = [Steps(RADAU, few) for few in FEW if chosen.integrator == RK4 or few > n]
+    explicit = [Steps(RK4, more) for more in TRIED if more > n]
+    if chosen.integrator == RADAU:
+        return [chosen, *implicit]
+    if integrator == RK4 or n > PRICE:
+        return [chosen, *explicit]
+    few = [steps for steps in explicit if steps.substeps <= PRICE]
+    return [chosen, *few, *implicit] if stiff() else [chosen, *few, implicit[0], *explicit[len(few):]]
+
+
+def _words(steps: Steps) -> str:
+    kind = "Runge-Kutta" if steps.integrator == RK4 else "implicit Radau"
+    return f"{steps.substeps} {kind} step" + ("s" if steps.substeps > 1 else "")
+
+
 def _tell(owner: str, chosen: Steps, grid: Grid, found: dict[Steps, Grid | None], fastest: Callable[[], float]) -> None:
     """Warns where the steps that are taken are not one of Runge and Kutta's, or are too long."""
     first = next(iter(found.values()))
@@ -143,7 +186,8 @@ def _tell(owner: str, chosen: Steps, grid: Grid, found: dict[Steps, Grid | None]
     elif chosen.integrator == RADAU:
         mode = min(fastest(), *(one.fastest for one in found.values() if one is not None))
         more = f", {chosen.substeps} steps in an interval" if chosen.substeps > 1 else ""
-        warnings.warn(f"{owner}: fastest mode {_time(mode)}, step {_time(grid.step)}: implicit Radau, "
+        what = f"fastest mode {_time(mode)}" if math.isfinite(mode) else "nothing decays, grows or swings by itself"
+        warnings.warn(f"{owner}: {what}, step {_time(grid.step)}: implicit Radau, "
                       f"{radau.STAGES} stages{more}; {grid.parts} agree to {100 * grid.error:.2g} %", stacklevel=5)
     elif len(found) > 1 and first is None:
         warnings.warn(f"{owner}: with one Runge-Kutta step in an interval nothing was solved; {chosen.substeps} are "

@@ -27,7 +27,7 @@ from nocl.definition import discrete
 from nocl.definition.constraints import TOLERANCE
 from nocl.definition.functions import Functions
 from nocl.definition.ocp import OCP
-from nocl.definition.substeps import COARSE, INTEGRATORS, RK4, Grid, Steps, settled
+from nocl.definition.substeps import COARSE, INTEGRATORS, RK4, STABLE, STARTS, TRIED, Grid, Steps, enduring, settled
 from nocl.solvers.between import EXCHANGES, MOST, SAME, Dips
 from nocl.solvers.ddp.augmented import Augmented
 from nocl.solvers.ddp.batch import Job, Piece, assembled, by_length, of_lengths, pieces, stretched
@@ -62,7 +62,8 @@ class DDP:
         K, the number of held controls on [t0, T]. Default: 80; in discrete time one a step, and no other number.
     substeps : int, optional
         Steps in each interval. Default: 1, or where a few solutions from the OCP's initial states show that this is
-        too coarse for the plant, as many as they ask for (nocl/definition/substeps.py); a warning says so.
+        too coarse for the plant, as many as they ask for, and as keep initial states under held controls from running
+        away (nocl/definition/substeps.py); a warning says so.
     integrator : "rk4" or "radau", optional
         Explicit Runge-Kutta steps, or implicit ones (Radau IIA, 3 stages), which stiff systems need. Default: implicit
         where substeps are left to nocl too, and explicit ones would be many; the warning says so.
@@ -433,7 +434,8 @@ def substeps_for(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int, tol
 @lru_cache(maxsize=32)
 def steps_for(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int, tolerance: float = COARSE,
               integrator: str | None = None) -> Steps:
-    """The steps that solutions from a few initial states ask for, so that they are off by `tolerance` at most.
+    """The steps that solutions from a few initial states ask for, so that they are off by `tolerance` at most, and with
+    which more initial states stay finite under held controls.
 
     integrator : of these steps alone; None: RK4, or implicit ones where it would take many of those
     """
@@ -443,10 +445,15 @@ def steps_for(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int, tolera
     tried = ocp if ocp.states_only or free else ocp.unconstrained  # a few descents, to see how fast the plant is
     functions, (x0, p) = _functions(tried, dynamics), firsts(ocp)
 
-    def solved(steps: Steps) -> Solution:
+    @cache
+    def ddp_of(intervals: int, steps: Steps) -> DDP:
         ddp = DDP(tried, intervals=intervals, substeps=steps.substeps, integrator=steps.integrator, dynamics=dynamics,
                   constraints="hard" if free else "soft")
         ddp.checked = True
+        return ddp
+
+    def solved(steps: Steps) -> Solution:
+        ddp = ddp_of(intervals, steps)
         return ddp.solve(x0, p=p, progress=False) if ocp.has_goal else _best_of_few(ddp, x0, p)
 
     def ask(steps: Steps) -> Grid | None:
@@ -458,9 +465,19 @@ def steps_for(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int, tolera
         """Without a goal optima may be where a coarse grid has none: those of a fine one are asked about."""
         return solved(Steps(substeps=FIRST))
 
-    step = (middle(ocp.horizon) if free else ocp.horizon) / intervals
-    return settled(f"DDP of {ocp.system.name}", ask, step, lambda: fastest_at_start(ocp, functions), tolerance,
-                   integrator)
+    @cache
+    def kept(steps: Steps) -> int:
+        """With controls held, substeps are intervals: one kernel has them all."""
+        starts, values = firsts(ocp, STARTS)
+        one = ddp_of(intervals * steps.substeps, Steps(steps.integrator))
+        return int(np.isfinite(one._work(starts, np.zeros(STARTS), {}, values if ocp.np else None).J).sum())
+
+    def stiff() -> bool:
+        return step > STABLE * TRIED[-1] * fastest_at_start(ocp, functions, STARTS)
+
+    owner, step = f"DDP of {ocp.system.name}", (middle(ocp.horizon) if free else ocp.horizon) / intervals
+    chosen = settled(owner, ask, step, lambda: fastest_at_start(ocp, functions), tolerance, integrator)
+    return enduring(owner, chosen, kept, stiff, ask, tolerance, integrator)
 
 
 def _best_of_few(ddp: DDP, x0: Array, p: Array) -> Solution:
