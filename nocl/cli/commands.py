@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from nocl import __version__
 from nocl.cli import arguments, reproduce
-from nocl.definition.substeps import INTEGRATORS, RADAU, USUAL
+from nocl.definition.substeps import INTEGRATORS, USUAL
 from nocl.solvers import registry
 from nocl.support.fields import EFFORTS
 from nocl.support.lock import alone
@@ -220,11 +220,8 @@ def _doctor(args: argparse.Namespace) -> None:
         raise ValueError(f"doctor: {sum(one.verdict == 'PROBLEM' for one in found.findings)} problem(s), named above")
 
 
-def _check_learnable(ocp: OCP, integrator: str | None = None) -> None:
-    """ValueError where dynamics are to be learned of a system that holds the time, or trained on by implicit steps."""
-    if integrator == RADAU:
-        raise ValueError("--integrator radau makes steps of the exact f, and training is to be on learned dynamics; "
-                         "expected both: add --exact, or leave it out")
+def _check_learnable(ocp: OCP) -> None:
+    """ValueError where dynamics are to be learned of a system that holds the time."""
     ocp.system.refuse_discrete("learning the dynamics", "to train on the equations: --exact")
     if ocp.system.uses_time:
         raise ValueError("learned dynamics are not implemented for the time t, which the system "
@@ -237,7 +234,7 @@ def _run(args: argparse.Namespace) -> None:
     ocp, out = _problem(args)
     if not args.exact:
         ocp.refuse_free("nocl run without --exact")
-        _check_learnable(ocp, args.integrator)
+        _check_learnable(ocp)
     stages = RunFolder(ocp, out, args.seed, args.effort, args.minutes, args.intervals, args.integrator)
     stages.check(exact=args.exact)
     _refuse(ocp, args.methods, registry.Options(args.intervals, args.seed))
@@ -283,7 +280,7 @@ def _train(args: argparse.Namespace) -> None:
     ocp, out = _problem(args)
     if not args.exact:
         ocp.refuse_free("nocl train without --exact")
-        _check_learnable(ocp, args.integrator)
+        _check_learnable(ocp)
     stages = RunFolder(ocp, out, args.seed, args.effort, args.minutes, args.intervals, args.integrator)
     stages.check(exact=args.exact)
     with alone(out):

@@ -65,7 +65,7 @@ class TrainSettings(Scaled):
                                   "many where plans on these cost too much more than the optimum in continuous time")
     substeps: int | None = count(None, "steps in each interval", none="as many as a few solutions ask for, held "
                                  "against the plant on far shorter steps; the card says how many")
-    integrator: str = choice(AUTO, "of these steps: Runge-Kutta's, implicit ones (Radau) of the exact f, or, auto, "
+    integrator: str = choice(AUTO, "of these steps: Runge-Kutta's, implicit ones (Radau), or, auto, "
                              "implicit ones where substeps are left to nocl and explicit ones would be too many",
                              (AUTO, *INTEGRATORS))
     seeds: int = count(20, "initial states solved globally, from cold starts")

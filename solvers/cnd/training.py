@@ -213,14 +213,10 @@ def _expect(settings: Any, kind: Any) -> Any:
 
 
 def _steps(ocp: OCP, dynamics: LearnedDynamics | None, s: TrainSettings, intervals: int) -> Steps:
-    """Those of an interval; chosen by a few solutions, explicit ones alone on learned dynamics."""
-    if dynamics is not None and s.integrator == RADAU:
-        raise ValueError("train: integrator='radau' makes steps of the exact f, and training is on learned dynamics; "
-                         "expected 'auto' or 'rk4', with more substeps or intervals where the plant is fast")
+    """Those of an interval; chosen by a few solutions, of f_theta where dynamics are learned."""
     if ocp.system.is_discrete:
         return discrete.check_steps(ocp.system, s.substeps, None, "train")
-    usual = None if dynamics is None else RK4
-    integrator = usual if s.integrator == AUTO else s.integrator
+    integrator = None if s.integrator == AUTO else s.integrator
     if s.substeps:
         return Steps(integrator or RK4, s.substeps)
     return steps_for(ocp, dynamics, intervals, FINE, integrator)

@@ -7,7 +7,6 @@ of Newton's method, so that feedback on what is fast is followed too. All rows o
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cached_property
 from typing import Any
 
 import casadi as ca
@@ -25,24 +24,17 @@ Field = Callable[[Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]  # x, t of sta
 
 
 class Implicit:
-    """Steps of an OCP's exact f; rows where Newton's method does not converge become NaN.
+    """Steps of an OCP's exact f, or of a learned one; rows where Newton's method does not converge become NaN.
 
+    learned : whether f is a network's, whose slopes are torch's own
     rows : the problem at the rows' parameters, an in_torch.Rows
     h, t : length and beginning of the intervals, [B, 1] or a number
     """
 
-    def __init__(self, ocp: OCP) -> None:
-        self.ocp, self.nx = ocp, ocp.system.nx
+    def __init__(self, ocp: OCP, learned: bool = False) -> None:
+        self.nx, self.slopes = ocp.system.nx, None if learned else _slopes_of(ocp)
         self.unit = torch.from_numpy(usual_sizes(ocp).x)
         self.weight, self.reach = torch.from_numpy(WEIGHT), torch.from_numpy(REACH)
-
-    @cached_property
-    def slopes(self) -> Any:
-        """df/d(x, u) of rows, in torch: [B, nx (nx + nu)], column by column."""
-        f = self.ocp.functions.f
-        given = f.sx_in()
-        slopes = ca.densify(ca.jacobian(f(*given), ca.vertcat(*given[:2])))
-        return to_torch(ca.Function("slopes", given, [ca.vec(slopes)]))
 
     def interval(self, rows: Any, x: Tensor, u: Tensor, t: Any, h: Any, substeps: int) -> tuple[Tensor, Tensor]:
         """(the states [B, nx] after intervals with u [B, nu] held, the integrals [B, 1] of L over them)."""
@@ -58,7 +50,7 @@ class Implicit:
             each = rows[part].repeated(STAGES)
 
             def field(x: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-                u, u_x = _with_slope(policy, x, t, each.p)
+                u, (u_x,) = _with_slopes(lambda x: policy(x, t, *each.p), x)
                 f, f_x, f_u = self._f(each, x, u, t)
                 return u, f, f_x + f_u @ u_x
             return field
@@ -66,6 +58,9 @@ class Implicit:
         return self._pieces(rows, x, t, h, 1, closed)
 
     def _f(self, each: Any, x: Tensor, u: Tensor, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        if self.slopes is None:
+            f, (f_x, f_u) = _with_slopes(lambda x, u: each.f(x, u, t), x, u)
+            return f, f_x, f_u
         slopes = each.of_f(self.slopes, x, u, t).reshape(len(x), -1, self.nx).transpose(1, 2)
         return each.f(x, u, t), slopes[:, :, :self.nx], slopes[:, :, self.nx:]
 
@@ -107,10 +102,20 @@ class Implicit:
         return torch.where(lost[:, None, None], torch.nan, x[:, None] + z), times
 
 
-def _with_slope(policy: Policy, x: Tensor, t: Tensor, p: list[Tensor]) -> tuple[Tensor, Tensor]:
-    """(u [B, nu], du/dx [B, nu, nx]) of a policy whose rows do not see each other."""
+def _slopes_of(ocp: OCP) -> Any:
+    """df/d(x, u) of rows, in torch: [B, nx (nx + nu)], column by column."""
+    f = ocp.functions.f
+    given = f.sx_in()
+    slopes = ca.densify(ca.jacobian(f(*given), ca.vertcat(*given[:2])))
+    return to_torch(ca.Function("slopes", given, [ca.vec(slopes)]))
+
+
+def _with_slopes(function: Callable[..., Tensor], *given: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """(y [B, m], its slopes [B, m, n] in each of the given) of a function whose rows do not see each other."""
     with torch.enable_grad():
-        at = x.detach().requires_grad_()
-        u = policy(at, t, *p)
-        slopes = [torch.autograd.grad(one, at, retain_graph=True, allow_unused=True)[0] for one in u.sum(dim=0)]
-    return u.detach(), torch.stack([torch.zeros_like(x) if one is None else one for one in slopes], dim=1)
+        at = [one.detach().requires_grad_() for one in given]
+        y = function(*at)
+        rows = [torch.autograd.grad(one, at, retain_graph=True, allow_unused=True) for one in y.sum(dim=0)]
+    slopes = [torch.stack([torch.zeros_like(one) if row[i] is None else row[i] for row in rows], dim=1)
+              for i, one in enumerate(at)]
+    return y.detach(), slopes

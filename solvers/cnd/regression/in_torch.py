@@ -23,12 +23,12 @@ class InTorch:
     """f, L and G of a problem as torch functions of what they take among (x, u, t, p).
 
     dynamics : (x, u[, t][, p of the system]) -> xdot in torch, as learned, in place of the exact f
-    integrator : of its steps; implicit ones are those of the exact f
+    integrator : of its steps
     """
 
     def __init__(self, ocp: OCP, dynamics: Function | None = None, integrator: str = RK4) -> None:
         self.ocp, self.timed = ocp, ocp.uses_time
-        self.implicit = Implicit(ocp) if integrator == RADAU else None
+        self.implicit = Implicit(ocp, dynamics is not None) if integrator == RADAU else None
         names = ocp.functions.arguments.names
         self.takes = {"f": names if dynamics is None else ocp.system.arguments.names, "L": names,
                       "G": ocp.functions.end.names}
