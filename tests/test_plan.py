@@ -15,7 +15,7 @@ from nocl.solvers.cnd import TrainSettings
 from nocl.solvers.cnd.plan import SCALED, Costs, Kind, Plan, iterations, measured, missed_by, stages, stalled
 from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.cnd.regression.regress import LEAST, fit_net
-from nocl.solvers.cnd.validate import floored_by, labels_gap, solved_again
+from nocl.solvers.cnd.validate import Finer, floored_by, labels_gap, solved_again
 from nocl.solvers.ddp.solver import DDP
 from nocl.support.budget import Budget
 from nocl.sysid import fitting
@@ -194,10 +194,24 @@ def test_plans_whose_open_loop_runs_away_are_refined_as_feedback():
     assert held.success.sum() < len(labels) - 4
 
 
+def test_margins_are_left_behind_on_the_way_to_the_fine_grid():
+    ocp = nocl.load_ocp(Path(__file__).resolve().parents[1] / "examples" / "epidemic.py")
+    plain, fine = DDP(ocp, intervals=40, threads=1, constraints="elastic"), DDP(ocp, intervals=160, threads=1)
+    inside = plain.inside(np.full(len(plain.rows.stage), 0.02)).solve(ocp.initial_states.sample(4, 5), progress=False)
+    assert inside.success.all()
+    bare = Finer(fine, plain).without_margins(inside)
+    assert (bare.cost < 0.999 * inside.cost).all()
+    found, straight = solved_again(Finer(fine, plain), inside), solved_again(fine, inside)
+    assert found.cost == pytest.approx(straight.cost, rel=1e-7)
+    assert (found.iterations < 0.5 * straight.iterations).all()
+
+
 def test_what_floors_the_gap_is_named():
     last = {**row(1.2e-2), "loss": [1e-4]}
     assert "on 80 intervals, cost 1.1 % more" in floored_by(last, 1.1e-2, 80, 2e-4)
     assert "--intervals 160" in floored_by(last, 1.1e-2, 80, 2e-4)
+    assert "keep margins inside the constraints, which cost 1 %" in floored_by(last, 1.1e-2, 80, 2e-4, 1e-3)
+    assert "on 80 intervals" in floored_by(last, 1.1e-2, 80, 2e-4, 1e-2)
     assert "misses its own labels" in floored_by({**last, "loss": [1e-2]}, 1e-5, 80, 2e-4)
     assert "do not cover" in floored_by(last, 1e-5, 80, 2e-4)
     assert "several kinds" in floored_by({**row(1e-4, 0.5), "loss": [1e-2]}, 1e-5, 80, 2e-4)

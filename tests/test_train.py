@@ -156,6 +156,18 @@ def test_same_seed_same_controller_and_others_differ():
     assert not np.array_equal(runs[0](x, 0.7), runs[2](x, 0.7))
 
 
+@pytest.mark.filterwarnings("ignore:mayer")
+def test_a_cost_at_the_end_alone_has_a_residual_in_its_own_units():
+    """L = 0: there is no running cost to measure the HJB residual by."""
+    p, v, u = (ca.SX.sym(name) for name in "pvu")
+    system = nocl.System("mayer", x=ca.vertcat(p, v), u=u, xdot=ca.vertcat(v, u - 0.2 * u**2), lbu=[-1], ubu=[1],
+                         lbx=[-2, -2], ubx=[2, 2])
+    ocp = nocl.OCP(system, horizon=1.0, running=0.0, terminal=1 + p**2 + v**2, x_goal=[0, 0], u_goal=[0],
+                   initial_states=nocl.Uniform([0.5, -0.1], [1, 0.1]))
+    card = nocl.train(ocp, settings=replace(TINY, rounds=0), progress=False).card["value"]
+    assert np.isfinite([card["hjb_median"], card["hjb_mean"]]).all()
+
+
 def test_training_leaves_torch_as_it_was():
     torch.manual_seed(5)
     before, threads = torch.random.get_rng_state(), torch.get_num_threads()

@@ -61,6 +61,7 @@ from nocl.solvers.cnd.regression.rolled import Rolled
 from nocl.solvers.cnd.settings import AUTO, TrainSettings, identity
 from nocl.solvers.cnd.stationary import StationaryTraining, check_stationary
 from nocl.solvers.cnd.validate import (
+    Finer,
     advice,
     cannot_hold,
     floored_by,
@@ -258,6 +259,7 @@ class Training:
         """Labels keep these margins from now on."""
         self.margin = margin
         self.ddp = self.plain if margin is None or self.held is None else self.held.solver(self.plain, margin)
+        self.finer = Finer(self.fine, self.plain if margin is not None and margin.any() else None)
 
     @property
     def margins_move(self) -> bool:
@@ -351,14 +353,21 @@ class Training:
         fresh = Problems.initial(self.ocp, s.held_out, self._rng(1_000_000))
         labels = extend(self.ddp, self.bank, fresh.x, p=fresh.given_p)
         labels = labels[labels.success]
-        best = solved_again(self.fine, labels)
+        best = solved_again(self.finer, labels)
         labels, best = labels[best.success], best[best.success]
         if not len(best):
             return "no held-out state was solved"
-        lost = 0.0 if self.ocp.system.is_discrete else \
-            summary(labels_gap(self.in_torch, labels, best, self.fine.substeps), "labels")["labels_median"]
-        row["floor"] = {"labels_median": lost, "by": floored_by(row, lost, s.grid, s.gap_median)}
+        lost, bare = self._lost(labels, best), None
+        if self.finer.plain is not None:
+            bare = self._lost(self.finer.without_margins(labels), best)
+        row["floor"] = {"labels_median": lost, "by": floored_by(row, lost, s.grid, s.gap_median, bare)}
         return str(row["floor"]["by"])
+
+    def _lost(self, plans: Solution, best: Solution) -> float:
+        """The median of what plans on the labels' grid cost more than the best, as feedback; none in discrete time."""
+        if self.ocp.system.is_discrete:
+            return 0.0
+        return summary(labels_gap(self.in_torch, plans, best, self.fine.substeps), "labels")["labels_median"]
 
     def _first_labels(self) -> None:
         s, rng = self.plan.within("labels"), self._rng(0)
@@ -509,7 +518,7 @@ class Training:
         on states of kicked rollouts."""
         s, rng = self.plan.within("check", self.round), self._rng(1_000_000)
         with self._solving("check", self.round, s, "held-out states", 1) as bar:
-            solvers, acting = (self.ddp, self.fine, self.bank), (self.policy, self.in_torch)
+            solvers, acting = (self.ddp, self.finer, self.bank), (self.policy, self.in_torch)
             at = Problems.initial(self.ocp, s.held_out, rng)
             if self.judged is None or self.judged[0] is not self.bank:
                 self.judged = self.bank, held_out(*solvers, at)  # rounds share what does not hang on the policy
@@ -558,7 +567,7 @@ class Training:
     def _value(self) -> FeatureNet:
         """V, fitted again on more labels where the held-out states ask for it; the best fit is kept."""
         s, rng, losses, tried = self.settings, self._rng(2_000_000), list[float](), list[float]()
-        labels, optima = ValueLabels.of(on_fine_grid(self.fine, self.bank.solution)), self._value_optima()
+        labels, optima = ValueLabels.of(on_fine_grid(self.finer, self.bank.solution)), self._value_optima()
         for attempt in range(s.value_rounds):
             labels = ValueLabels.join([labels, self._value_labels(rng, attempt)])
             if attempt == 0:
@@ -586,7 +595,7 @@ class Training:
     def _value_optima(self) -> dict[str, Solution]:
         """What V is judged on: initial states, states of the tube, and states of kicked rollouts, solved anew."""
         s, rng = self.plan.within("value check"), self._rng(3_000_000)
-        solvers, n = (self.ddp, self.fine, self.bank), VALUE_HELD_OUT * s.held_out
+        solvers, n = (self.ddp, self.finer, self.bank), VALUE_HELD_OUT * s.held_out
         acting = (self.policy, self.in_torch)
         with self._solving("value check", 0, s, "held-out states for V", 3) as bar:
             sets = {"initial": held_out_optima(*solvers, Problems.initial(self.ocp, n, rng))}
@@ -602,7 +611,7 @@ class Training:
         with self._solving("value labels", attempt, s, "value labels", 1) as bar:
             found = value_tails(self.ddp, self.bank, self.policy, self.in_torch, initial=s.value_initial,
                                 tails=s.value_tails, visits=s.value_visits, width=s.width, kick=s.kick, rng=rng)
-            labels = ValueLabels.of(on_fine_grid(self.fine, found))
+            labels = ValueLabels.of(on_fine_grid(self.finer, found))
             bar.update()
         return labels
 

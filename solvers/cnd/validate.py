@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -35,17 +35,40 @@ COLD = 4  # starts of held-out states that the bank's solutions do not lead to
 NODES = 16  # of each solution at which the HJB residual is taken
 
 
-def refined(fine: DDP, coarse: Solution) -> Solution:
+@dataclass(frozen=True)
+class Finer:
+    """A solver on a fine grid, and where plans keep margins inside their constraints one on theirs that keeps none: to
+    get to the boundary takes many more iterations than to change the grid."""
+
+    ddp: DDP
+    plain: DDP | None = None
+
+    def without_margins(self, s: Solution) -> Solution:
+        """The solutions without the margins; as they are where that fails."""
+        if self.plain is None:
+            return s
+        found = self.plain.solve(s.x[:, 0], s.t[:, 0], p=s.p, u=s.u, x=s.x, gain=s.gain)
+        s = replace(s, tried=None)
+        s.put(np.flatnonzero(found.success), found[found.success])
+        return s
+
+
+Fine: TypeAlias = DDP | Finer
+
+
+def refined(fine: Fine, coarse: Solution) -> Solution:
     """The solutions that succeeded, solved again on the fine grid: those that succeed there."""
     finer = solved_again(fine, coarse)
     return finer[finer.success]
 
 
-def solved_again(fine: DDP, coarse: Solution) -> Solution:
+def solved_again(fine: Fine, coarse: Solution) -> Solution:
     """The solutions that succeeded, solved again on the fine grid, from them as feedback: open loops may run away."""
-    s, times = coarse[coarse.success], fine.intervals // coarse.u.shape[1]
+    finer = fine if isinstance(fine, Finer) else Finer(fine)
+    s = finer.without_margins(coarse[coarse.success])
+    times = finer.ddp.intervals // s.u.shape[1]
     u, gain = (np.repeat(of, times, axis=1) for of in (s.u, s.gain))
-    return fine.solve(s.x[:, 0], s.t[:, 0], p=s.p, u=u, x=_between(s.x, times), gain=gain)
+    return finer.ddp.solve(s.x[:, 0], s.t[:, 0], p=s.p, u=u, x=_between(s.x, times), gain=gain)
 
 
 def _between(x: Array, times: int) -> Array:
@@ -55,7 +78,7 @@ def _between(x: Array, times: int) -> Array:
     return finer
 
 
-def held_out(ddp: DDP, fine: DDP, bank: SolutionBank, fresh: Problems) -> Solution:
+def held_out(ddp: DDP, fine: Fine, bank: SolutionBank, fresh: Problems) -> Solution:
     """Fresh initial states, solved from the bank's nearest; where that fails, from cold starts."""
     found = extend(ddp, bank, fresh.x, p=fresh.given_p)
     lost = np.flatnonzero(~found.success & ~_infeasible(found))
@@ -67,7 +90,7 @@ def held_out(ddp: DDP, fine: DDP, bank: SolutionBank, fresh: Problems) -> Soluti
     return solved_again(fine, found)
 
 
-def held_out_optima(ddp: DDP, fine: DDP, bank: SolutionBank, fresh: Problems) -> Solution:
+def held_out_optima(ddp: DDP, fine: Fine, bank: SolutionBank, fresh: Problems) -> Solution:
     """The optima of fresh initial states."""
     solved = held_out(ddp, fine, bank, fresh)
     return solved[solved.success]
@@ -82,14 +105,14 @@ def _infeasible(s: Solution) -> NDArray[np.bool_]:
     return ~s.success & np.char.startswith(s.message, "infeasible")
 
 
-def kicked_optima(ddp: DDP, fine: DDP, bank: SolutionBank, policy: Policy, torch_ocp: InTorch, n: int, kick: float,
+def kicked_optima(ddp: DDP, fine: Fine, bank: SolutionBank, policy: Policy, torch_ocp: InTorch, n: int, kick: float,
                   rng: np.random.Generator) -> Solution:
     """The optima from n states that the policy visits under kicks, at times all over the horizon."""
     at = kicked_states(bank, policy, torch_ocp, n, kick, rng, ddp.substeps)
     return refined(fine, answered(ddp, bank, policy, torch_ocp, at))
 
 
-def tube_optima(ddp: DDP, fine: DDP, bank: SolutionBank, policy: Policy, torch_ocp: InTorch, n: int, width: float,
+def tube_optima(ddp: DDP, fine: Fine, bank: SolutionBank, policy: Policy, torch_ocp: InTorch, n: int, width: float,
                 rng: np.random.Generator) -> Solution:
     """The optima from n states of the tube."""
     _, at = tube_states(ddp.ocp, bank, n, width, rng)
@@ -145,13 +168,17 @@ def labels_gap(torch_ocp: InTorch, labels: Solution, best: Solution, substeps: i
     return gap(lambda x, t, *p: torch.clamp(follow(x, t, *p), low, high), torch_ocp, best, substeps=substeps)
 
 
-def floored_by(row: dict[str, Any], labels: float, intervals: int, goal: float) -> str:
+def floored_by(row: dict[str, Any], labels: float, intervals: int, goal: float, bare: float | None = None) -> str:
     """What keeps the last round's gap where it is, with what to try.
 
     labels : the median gap of the labels' own plans as feedback
+    bare : the same of plans without the margins that labels keep; None where they keep none
     """
     median = row["gap_median"]
     if labels > max(goal, FLOOR * median):
+        if bare is not None and bare <= FLOOR * labels:
+            return (f"its labels keep margins inside the constraints, which cost {100 * (labels - bare):.2g} %: rounds "
+                    "that violate nothing make them smaller, TrainSettings(rounds=...)")
         return (f"its labels' own plans, on {intervals} intervals, cost {100 * labels:.2g} % more than the optimum "
                 f"when followed: the grid floors the gap, more intervals lower it (--intervals {2 * intervals}, "
                 f"TrainSettings(intervals={2 * intervals}))")

@@ -24,7 +24,7 @@ from nocl.solvers.cnd.regression.features import features
 from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.cnd.regression.labels import Policy, Problems, answered, kicked_states, tube_states
 from nocl.solvers.cnd.regression.regress import LossFunction
-from nocl.solvers.cnd.validate import refined
+from nocl.solvers.cnd.validate import Fine, refined
 from nocl.solvers.ddp.bank import SolutionBank
 from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
@@ -81,7 +81,7 @@ def value_tails(ddp: DDP, bank: SolutionBank, policy: Policy, torch_ocp: InTorch
     return answered(ddp, bank, policy, torch_ocp, Problems.join([start, near, kicked]))
 
 
-def on_fine_grid(fine: DDP, coarse: Solution) -> Iterator[Solution]:
+def on_fine_grid(fine: Fine, coarse: Solution) -> Iterator[Solution]:
     """The solutions that succeeded on both grids: a held control costs O(h^2) more than a continuous one. Piece by
     piece, since they take much memory."""
     for start in range(0, len(coarse), PIECE):
