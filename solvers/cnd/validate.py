@@ -48,7 +48,7 @@ class Finer:
         if self.plain is None:
             return s
         found = self.plain.solve(s.x[:, 0], s.t[:, 0], p=s.p, u=s.u, x=s.x, gain=s.gain)
-        s = replace(s, tried=None)
+        s = replace(s, tried=None)[np.arange(len(s))]  # a copy
         s.put(np.flatnonzero(found.success), found[found.success])
         return s
 
