@@ -26,7 +26,7 @@ except ImportError as error:
 
 SAMPLING = 0.5  # of the minutes; the rest is training's
 TRIED = 16  # solves that say how long one takes
-EPOCHS_TRIED = 30
+EPOCHS_TRIED = 200  # that say how long one takes
 STATES = ("x", "left", "paid")
 PLATEAU = 0.05  # of the epochs, that the learning rate waits for; so its falls take up all of training
 
@@ -127,6 +127,7 @@ def learned(task: dict[str, Any], folder: Path) -> dict[str, Any]:
     each = (time.process_time() - start) / TRIED
     n = max(int((SAMPLING * seconds - (time.process_time() - begin)) / each), 2 * TRIED)
     solved = sample(mpc, task, folder, "samples", n)
+    fit(law, folder, "samples", EPOCHS_TRIED // 10)  # the first takes longer than others
     start = time.process_time()
     fit(law, folder, "samples", EPOCHS_TRIED)
     each = (time.process_time() - start) / EPOCHS_TRIED
