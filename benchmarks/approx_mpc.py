@@ -14,10 +14,10 @@ nocl.train has --minutes of wall-clock time; do-mpc then has as many minutes of 
 twice, once for each way of sampling, and the better one counts:
 box     AMPCSampler as it is: uniform in a box, here that of optimal runs from 32 initial states, a tenth wider
 tube    AMPCSampler, its plan overwritten: states of those runs with their times, moved by up to a tenth of the box
-The runs are nocl's NMPC's and are not counted: do-mpc gets them as a gift. Half of its minutes go
-into samples, the rest into training.
+The runs are nocl's NMPC's and are not counted: do-mpc gets them as a gift. Half of its minutes go into samples, the
+rest into training.
 
-Both laws then act as continuous feedback from the same fresh initial states under benchmarks/independent.py's LSODA.
+All laws then act as continuous feedback from the same fresh initial states under benchmarks/independent.py's LSODA.
 "gap" is (J - J*) / |J*| as in benchmarks/strangers.py, J* the best that NMPC, DDP and collocation find from several
 starts, those of all three laws' runs among them. "closer" is do-mpc's gap over nocl's; a gap of nocl's below RESOLUTION
 counts as that. Rows go to benchmarks/results/approx_mpc.json, those of problems that are not run are kept.
