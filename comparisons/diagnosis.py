@@ -162,17 +162,23 @@ def _held(ocp: OCP, seed: int) -> Iterator[Finding]:
     x0, p = ocp.initial_states.sample(n, seed), ocp.sample_parameters(n, seed)
     laws = {"u*": ocp.goals(p)[1], "the middle of U": np.tile((s.lbu + s.ubu) / 2, (n, 1)),
             "lbu": np.tile(s.lbu, (n, 1)), "ubu": np.tile(s.ubu, (n, 1))}
-    lost, least = {}, 0.0
+    lost, least, far = {}, 0.0, 0.0
     for name, u in laws.items():
         held = np.clip(u, s.lbu, s.ubu)
         run = simulate(ocp, np.repeat(held[:, None], LOOKS, axis=1), x0, p=p if ocp.np else None)
         if not run.reached.all():
             lost[name] = int((~run.reached).sum())
-        least = min(least, _least(ocp, run, held, p))
+        if not ocp.constraint_names:  # else they may be what bounds it
+            least, far = min(least, _heading(ocp, run, held, p)), min(far, _cheapest(ocp, run))
     if least < -FALLEN:
-        yield Finding("boundedness", PROBLEM, "states run away under controls that are held, and the cost falls "
-                      "without an end while they do: expected one that is bounded below; bound the states "
-                      "(state_bounds, constraints), or let what is gained saturate")
+        yield Finding("boundedness", PROBLEM, "states blow up under controls that are held, and the cost falls without "
+                      "an end while they do: expected one that is bounded below; bound the states (state_bounds, "
+                      "constraints), or let what is gained saturate")
+        return
+    if far < -FALLEN:
+        yield Finding("boundedness", REMARK, f"controls that are held cost as little as {far:.2g} times what is usual: "
+                      "to run away pays, and the horizon alone ends it; bound the states (state_bounds, constraints) "
+                      "where that is not meant")
         return
     if not lost:
         yield Finding("boundedness", OK, "states stay finite over the horizon under controls that are held")
@@ -183,16 +189,21 @@ def _held(ocp: OCP, seed: int) -> Iterator[Finding]:
                   "where the plant has it")
 
 
-def _least(ocp: OCP, run: Simulation, u: Array, p: Array) -> float:
-    """The least cost of runs with controls u [B, nu] held, in usual costs; of those that blow up that of L, over the
-    horizon, where they are heading: their last step before, AHEAD times as long.
+def _cheapest(ocp: OCP, run: Simulation) -> float:
+    """The least cost of runs, in usual costs; 0 at most."""
+    return float(np.fmin.reduce(run.cost, initial=0.0) / usual_sizes(ocp).cost)
+
+
+def _heading(ocp: OCP, run: Simulation, u: Array, p: Array) -> float:
+    """The least L, over the horizon and in usual costs, where runs that blow up are heading: their last step before,
+    AHEAD times as long; 0 at most. u [B, nu] is held.
     """
     lost, of = np.flatnonzero(~run.reached), ocp.functions
     last = np.isfinite(run.x[lost]).all(axis=2).sum(axis=1) - 1
     here, before = (run.x[lost, np.maximum(last - back, 0)] for back in (0, 1))
     x = here + AHEAD * (here - before)
     L = of.L(*of.arguments.columns(x=x, u=u[lost], t=run.t[last], p=p[lost])).full()
-    return float(np.fmin.reduce(np.r_[run.cost, ocp.longest * L.ravel()], initial=0.0) / usual_sizes(ocp).cost)
+    return float(np.fmin.reduce(L, axis=None, initial=0.0) * ocp.longest / usual_sizes(ocp).cost)
 
 
 # Solutions

@@ -78,32 +78,40 @@ class Yardstick:
     intervals: int
     seed: int
     best: Array  # [n], the cost of the exact optimum, as feedback
-    gain: Array  # [n], of simple baselines beyond that
+    gain: Array  # [n], of simple baselines beyond that; of a learned plant, that cost
+    plant: LearnedDynamics | None = None  # in place of the exact f
 
     @staticmethod
-    def of(ocp: OCP, n: int = STATES, intervals: int = INTERVALS, seed: int = 0) -> Yardstick:
-        """Of n states, fewer where some are not solved; ValueError where none is, or f is not known."""
+    def of(ocp: OCP, n: int = STATES, intervals: int = INTERVALS, seed: int = 0,
+           plant: LearnedDynamics | None = None) -> Yardstick:
+        """Of n states, fewer where some are not solved; ValueError where none is, or f is not known.
+
+        plant : what plans are made for and run on, in place of the exact f
+        """
         checks.problem(ocp, "model_loss")
-        if ocp.system.xdot is None:
+        if ocp.system.xdot is None and plant is None:
             raise ValueError(f"model_loss: the equations of {ocp.system.name!r} are not known; expected an exact f to "
                              "run on: model.validate(log) tells errors on logs")
         starts = Starts.drawn(ocp, n, checks.whole(seed, "seed", "model_loss"))
-        exact = _optimum(ocp, None, starts, intervals, seed)
-        cost = _run(ocp, exact, starts)
+        exact = _optimum(ocp, plant, starts, intervals, seed)
+        cost = _run(ocp, exact, starts, plant)
         there = np.isfinite(cost)
         if not there.any():
-            raise ValueError(f"model_loss: none of {n} initial states of {ocp.system.name!r} was solved on the exact f "
-                             f"({exact.message[0]}): see nocl doctor")
+            on = "the exact f" if plant is None else "the model"
+            raise ValueError(f"none of {n} initial states of {ocp.system.name!r} was solved on {on} "
+                             f"({exact.message[0]}), expected some: more intervals, or other bounds or initial states")
         starts, cost = starts[there], cost[there]
-        base = base_cost(ocp, starts, TOLERANCE, Solving(1, None, False)) - cost
+        base = np.full(len(cost), np.nan)
+        if plant is None:
+            base = base_cost(ocp, starts, TOLERANCE, Solving(1, None, False)) - cost
         least = np.maximum(SMALL * usual_sizes(ocp).cost, SMALL * np.abs(cost))
         gain = np.where(np.isfinite(base) & (base > least), base, np.maximum(np.abs(cost), least))
-        return Yardstick(ocp, starts, intervals, seed, cost, gain)
+        return Yardstick(ocp, starts, intervals, seed, cost, gain, plant)
 
     def loss(self, model: LearnedDynamics) -> tuple[ModelLoss, Solution]:
         """What a model loses, and its optima."""
         own = _optimum(self.ocp, model, self.starts, self.intervals, self.seed)
-        more = _run(self.ocp, own, self.starts) - self.best
+        more = _run(self.ocp, own, self.starts, self.plant) - self.best
         size = np.maximum(np.abs(self.best), SMALL * usual_sizes(self.ocp).cost)
         return ModelLoss(more / self.gain, more / size), own
 
@@ -127,8 +135,7 @@ def held_out_loss(ocp: OCP, model: LearnedDynamics, part: LearnedDynamics, *, n:
     """
     for name, one in (("model", model), ("part", part)):
         checks.instance(LearnedDynamics, one, name, "held_out_loss", "as nocl.identify makes it")
-    plant = replace(ocp, system=ocp.system.under(model.to_casadi()))
-    return Yardstick.of(plant, n, intervals, seed).loss(part)[0]
+    return Yardstick.of(ocp, n, intervals, seed, model).loss(part)[0]
 
 
 def good_enough(ocp: OCP, model: LearnedDynamics, wanted: float, settings: Settings, *, seed: int = 0,
@@ -185,13 +192,13 @@ def _optimum(ocp: OCP, model: LearnedDynamics | None, starts: Starts, intervals:
                               progress=False)
 
 
-def _run(ocp: OCP, s: Solution, starts: Starts) -> Array:
-    """[n], the cost of plans as feedback on the exact f; inf where they fail."""
+def _run(ocp: OCP, s: Solution, starts: Starts, plant: LearnedDynamics | None = None) -> Array:
+    """[n], the cost of plans as feedback on the exact f, or on a learned plant; inf where they fail."""
     K, cost = s.u.shape[1], np.full(len(s), np.inf)
     rows = np.flatnonzero(s.success)
     if rows.size:
         some = s[rows]
-        run = simulate(ocp, lambda x, t, *_: some.feedback(x, t), starts.x[rows], hold=K,
+        run = simulate(ocp, lambda x, t, *_: some.feedback(x, t), starts.x[rows], f=plant, hold=K,
                        p=starts.p[rows] if ocp.np else None)
         cost[rows] = np.where(run.success, run.cost, np.inf)
     return cost

@@ -55,5 +55,7 @@ class Stages:
             P = solve_discrete_are(self.A, self.B, self.Q, self.R, s=self.S)
         except (LinAlgError, ValueError):
             return None
-        stable = np.isfinite(P).all() and np.abs(np.linalg.eigvals(self.A - self.B @ self.gain(P))).max() < 1
+        if not np.isfinite(P).all() or np.linalg.eigvalsh(self.curvature(P)).min() <= 0:  # a saddle, or a maximum
+            return None
+        stable = np.abs(np.linalg.eigvals(self.A - self.B @ self.gain(P))).max() < 1
         return np.asarray(P) if stable else None

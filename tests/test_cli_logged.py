@@ -54,7 +54,7 @@ def test_from_a_log_to_a_controller_and_a_refusal(here, capsys):
     assert main(["identify", "plant.py", "--data", "log.csv", "--quick", "--out", "run"]) == 0
     out = capsys.readouterr().out
     assert "5 pieces of 5 recordings" in out
-    assert re.search(r"dynamics: that of four fifths, on that of all: f_theta loses [\d.e-]+ % of what control", out)
+    assert re.search(r"the optimum of the model of four fifths, on that of all: f_theta loses [\d.e-]+ % of what", out)
     model = LearnedDynamics.load(here / "run" / "dynamics")
     at = ca.DM([0.4, -0.3]), ca.DM([0.5])
     np.testing.assert_allclose(model.to_casadi()(*at).full().ravel(), [-0.3, -4 * 0.4 + 0.4 * 0.3 + 0.5], atol=0.1)

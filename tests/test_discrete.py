@@ -454,3 +454,13 @@ def test_a_controller_is_trained_saved_and_exported(tmp_path):
     moved = loaded.closed_loop_to_casadi()(x0[0], 0.3).full().ravel()
     np.testing.assert_allclose(moved, ocp.system.F(x0[0], cnd(x0[0], 0.3)).full().ravel(), rtol=1e-12)
     assert loaded.export(tmp_path / "export", to=("casadi",)).ok
+
+
+def test_an_infinite_horizon_s_maximum_is_no_answer():
+    """x+ = x + u with -(x^2 + u^2): the Riccati equation has a stabilising solution, which costs the most."""
+    x, u = ca.SX.sym("x"), ca.SX.sym("u")
+    system = nocl.System.discrete("most", x=x, u=u, x_next=x + u, lbu=[-9], ubu=[9], lbx=[-3], ubx=[3])
+    ocp = nocl.OCP(system, horizon=5.0, running=-(x**2 + u**2), terminal=0.0, x_goal=[0], u_goal=[0],
+                   initial_states=nocl.Uniform([-1], [1]))
+    with pytest.raises(ValueError, match="stabilis"):
+        LQR(ocp, infinite=True)

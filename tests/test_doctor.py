@@ -44,13 +44,17 @@ def test_states_that_blow_up_under_held_controls():
     assert "lbu" not in found.text
 
 
-@pytest.mark.parametrize(("x_dot", "L"), [(V**2 + U, -V), (3 * V + U, -V**2)])
-def test_a_cost_without_a_least(x_dot, L):
-    """What runs away is rewarded, in finite time or exponentially: no plan is the best."""
+@pytest.mark.parametrize(("x_dot", "L", "verdict", "says"), [
+    (V**2 + U, -V, PROBLEM, "bounded below"), (3 * V + U, -V**2, REMARK, "the horizon alone ends it")])
+def test_a_cost_that_rewards_what_runs_away(x_dot, L, verdict, says):
+    """In finite time: no plan is the best. Exponentially: one is, far outside the box. Constraints end both."""
     worth = {"terminal": 0.0, "x_goal": None, "u_goal": None, "horizon": 4.0}
     (found,) = _held(cart((V, x_dot), running=L + 0.1 * U**2, **worth), 0)
-    assert (found.about, found.verdict) == ("boundedness", PROBLEM)
-    assert "bounded below" in found.text
+    assert (found.about, found.verdict) == ("boundedness", verdict)
+    assert says in found.text
+    (found,) = _held(cart((V, x_dot), running=L + 0.1 * U**2, state_bounds={"v": (-2, 2)}, **worth), 0)
+    assert found.verdict != PROBLEM
+    assert says not in found.text
     (found,) = _held(cart((V, U - V), running=-V + 0.1 * U**2, **worth), 0)
     assert found.verdict == OK
 

@@ -132,7 +132,7 @@ class RunFolder:
             return
         more = "" if loss.median <= OPEN else \
             ": record more where the problem goes, or the controller will be one for this model alone"
-        say(f"dynamics: that of four fifths, on that of all: {loss}{more}")
+        say(f"dynamics: the optimum of the model of four fifths, on that of all: {loss}{more}")
 
     def train(self, exact: bool) -> CND:
         """The controller and value function, in cnd/; on dynamics/ unless exact."""

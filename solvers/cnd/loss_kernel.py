@@ -3,7 +3,6 @@ faster."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,6 +13,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from nocl.nets import MLP
+from nocl.support.pool import cores
 from nocl.translate.kernels import Kernel
 
 
@@ -38,7 +38,7 @@ class ValueKernel:
         size = np.empty(1, np.int64)
         self.kernel("nocl_value_work", size, size)
         self.bytes, self.work = int(size[0]), np.empty(0)
-        self.threads = os.cpu_count() or 1
+        self.threads = cores()
 
     def __call__(self, rows: Tensor) -> Tensor:
         """The loss of these rows [B], a scalar that autograd can go back from."""
