@@ -41,7 +41,7 @@ CHECKED = 2  # of them by NMPC, too
 AGREE = 1e-3  # of the cost: methods that differ by more disagree
 SMALL = 1e-3  # of a usual cost: costs are not divided by less
 AHEAD = 1e6  # steps, that what blows up is followed
-FALLEN = 1e3  # usual costs below 0: what costs as little has no least
+FALLEN = 1e3  # usual costs below 0: what costs as little runs away
 NEAR = 0.05  # of the cost: other optima that are so near make a switching surface
 
 
