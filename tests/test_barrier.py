@@ -89,11 +89,33 @@ def test_which_rows_the_map_holds():
     mixed = replace(ocp, constraints={"track": p + 1, "speed": 2 - v, "power": 2 - u * v, "equal": (0, p - v, 0),
                                       "time": 1 + nocl.time(), "push": 1 - u})
     assert dict(zip(mixed.functions.rows.names, guarded(mixed), strict=True)) == {
-        "track": True, "speed": True, "power": False, "equal": False, "time": False, "push": False}
+        "track": True, "speed": True, "power": True, "equal": False, "time": False, "push": False}
+    assert dict(zip(mixed.functions.rows.names, guarded(mixed, learned=True), strict=True)) == {
+        name: name == "power" for name in mixed.functions.rows.names}
     slow = nocl.limit_rates(ocp.system, {"u": 5.0})
     third = OCP(slow, horizon=4.0, running=slow.x[2]**2, terminal=slow.x[0]**2, x_goal=[0] * 3, u_goal=[0],
                 initial_states=nocl.Gaussian([0] * 3, [0.1] * 3), constraints={"track": (-0.5, slow.x[0], 0.5)})
     assert not guarded(third).any()
+
+
+@pytest.mark.parametrize("lasting", [4.0, 0.0])
+def test_a_limit_that_the_control_moves_at_once_is_held_as_it_stands(lasting):
+    """Power u v <= 0.5, force between bounds that move: no policy leaves them, and what holds them is left alone."""
+    ocp = on_a_track()
+    (_, v), u = ca.vertsplit(ocp.system.x), ocp.system.u
+    ocp = replace(ocp, constraints={"power": (None, u * v, 0.5), "force": u + 1 + ca.sin(nocl.time())})
+    s, at, rng = ocp.system, ocp.functions.feedback().given(said=ca.SX.sym("said", 1)), np.random.default_rng(0)
+    law = at.function("law", {"u": braked(ocp, at.but("said"), at["said"], lasting)})
+    x, t, said = rng.uniform(s.lbx, s.ubx, (500, 2)), rng.uniform(0, 4, 500), rng.uniform(s.lbu, s.ubu, (500, 1))
+    u = law(*at.columns(x=x, t=t, said=said)).full().T
+    power, force = 0.5 - u[:, 0] * x[:, 1], u[:, 0] + 1 + np.sin(t)
+    assert min(power.min(), force.min()) > -1e-4
+    assert (u >= s.lbu).all()
+    assert (u <= s.ubu).all()
+    inside = (said[:, 0] * x[:, 1] <= 0.5) & (said[:, 0] + 1 + np.sin(t) >= 0)
+    assert 100 < inside.sum() < 400
+    np.testing.assert_array_equal(u[inside], said[inside])
+    assert not Held(ocp, learned=not lasting).first.any()
 
 
 def car(xdot, wall, fastest: float = 2.0) -> OCP:

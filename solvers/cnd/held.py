@@ -40,7 +40,7 @@ LOST = 0.01  # of a scale: a plan that leaves more is no label
 class Held:
     """A problem's constraints: rows along the trajectory, then those at its end.
 
-    learned : whether the policy is trained on learned dynamics; the output map holds no rows of states then
+    learned : whether the policy is trained on learned dynamics; the output map holds no rows of states alone then
     """
 
     ocp: OCP
@@ -59,9 +59,8 @@ class Held:
 
     @cached_property
     def guarded(self) -> Any:
-        """Which rows the output map holds by braking."""
-        rows = guarded(self.ocp)
-        return np.r_[rows & (not self.learned), np.zeros(len(self.ocp.functions.end_rows), dtype=bool)]
+        """Which rows of states the output map holds."""
+        return np.r_[guarded(self.ocp, self.learned), np.zeros(len(self.ocp.functions.end_rows), dtype=bool)]
 
     @cached_property
     def scales(self) -> Array:

@@ -10,6 +10,8 @@ a track, is held by (control barrier functions: Ames et al., IEEE TAC 62(8), 201
     h' >= -h / s                                            (first derivative)
     h'' >= b - (1 - b / (r B)) (h / w^2 - h' / w)           (second; terms of h' where h' < 0, and 1 - ... where > 0)
 
+and one h(x, u, t, p) >= 0 that it moves itself, as a limit of power, as it stands, on learned dynamics too.
+
 b = h'^2 / (2 h) is the constant braking that stops at the boundary; a run that touches the boundary tends to it by
 itself. The other term lets braking be less while there is time, w, and while it takes less than a share r of B, the
 most that U gives. Where b = r B, b stays what it is, and h' -> 0 as h -> 0. Corrections take a time s, at least that
@@ -32,7 +34,8 @@ from numpy.typing import NDArray
 
 from nocl.definition.constraints import TOLERANCE
 from nocl.definition.ocp import OCP
-from nocl.solvers.cnd.regression.projection import retracted
+from nocl.solvers.cnd.regression.projection import projected, retracted
+from nocl.support.checks import Array
 from nocl.translate.arguments import Arguments
 
 CORRECTION = 1 / 400  # of a run: s, or less
@@ -45,33 +48,41 @@ SURE = 0.1  # of the usual movement: a row that it moves less somewhere is not f
 MOSTLY = 0.9  # of these places: where U must be able to turn it back
 IDLE = 1e-9  # of the largest: less is no movement
 RESERVE = 0.98  # of the braking that U gives: r
-FLAT = 0.03  # of the usual movement: where the control moves a row less than that, little is asked of it
+FLAT = (1e-3, 0.03, 0.03)  # of the usual movement, by order: where the control moves a row less, little is asked of it
 
 
 class Moved(NamedTuple):
-    """A row by what the control moves: h, h' and the derivative, h' or h'', that depends on u, in scales."""
+    """A row by what the control moves: h, h' and the first of h, h', h'' that depends on u, in scales."""
 
     h: ca.SX
     slope: ca.SX
-    moved: ca.SX
+    moved: ca.SX  # h, h' or h'', by the order
     order: int
     usual: float  # how far the half of U moves it, a median over X near h = 0
 
 
-def guarded(ocp: OCP) -> NDArray[np.bool_]:
-    """Which rows along a trajectory [m] the map holds: inequalities of (x, t, p) that the control moves soon enough."""
+def guarded(ocp: OCP, learned: bool = False) -> NDArray[np.bool_]:
+    """Which rows along a trajectory [m] the map holds: inequalities that the control moves soon enough, at once where
+    the dynamics are `learned`, and that are not of the control alone (projection.py)."""
     found = np.zeros(len(ocp.functions.rows), dtype=bool)
-    found[[i for i, _ in _rows(ocp)]] = True
+    found[[i for i, _ in _rows(ocp, learned)]] = True
     return found
 
 
-def _rows(ocp: OCP) -> list[tuple[int, Moved]]:
-    """Such rows by number; none where the equations of motion are not known, and in discrete time."""
-    rows = ocp.functions.rows
-    if ocp.system.xdot is None or ocp.system.is_discrete:
-        return []
-    moved = [(int(i), _moved(ocp, int(i))) for i in np.flatnonzero(~rows.of_u & ~rows.equal)]
+def _rows(ocp: OCP, learned: bool = False) -> list[tuple[int, Moved]]:
+    """Such rows by number; where the equations of motion are not known, and in discrete time, those moved at once."""
+    rows, blind = ocp.functions.rows, learned or ocp.system.xdot is None or ocp.system.is_discrete
+    mine = ~rows.equal & ~projected(ocp) & (rows.of_u | (not blind))
+    moved = [(int(i), _at_once(ocp, int(i)) if rows.of_u[i] else _moved(ocp, int(i))) for i in np.flatnonzero(mine)]
     return [(i, row) for i, row in moved if row is not None]
+
+
+def _at_once(ocp: OCP, i: int) -> Moved | None:
+    """Row i of states and controls; None where the map cannot hold it."""
+    h = ocp.functions.rows.column[i] / float(ocp.functions.scales[i])
+    by_u = _by_u(ocp, h)
+    usual = 0.0 if by_u is None else _usual_at_once(ocp, h, by_u)
+    return Moved(h, ca.SX(0), h, 0, usual) if usual > 0 else None
 
 
 def _moved(ocp: OCP, i: int) -> Moved | None:
@@ -80,11 +91,18 @@ def _moved(ocp: OCP, i: int) -> Moved | None:
     h, at = of.rows.column[i] / float(of.scales[i]) + TOLERANCE / 2, of.arguments
     slope = _along(ocp, h)
     for order, moved in ((1, slope), (2, _along(ocp, slope))):
-        by_u = ca.jacobian(moved, at["u"])
-        if by_u.nnz():
-            usual = 0.0 if ca.depends_on(by_u, at["u"]) else _usual(ocp, h, moved, by_u)
+        if ca.depends_on(moved, at["u"]):
+            by_u = _by_u(ocp, moved)
+            usual = 0.0 if by_u is None else _usual(ocp, h, moved, by_u)
             return Moved(h, slope, moved, order, usual) if usual > 0 else None
     return None
+
+
+def _by_u(ocp: OCP, moved: ca.SX) -> ca.SX | None:
+    """Its derivative by u [1, nu]; None where it is not affine in u."""
+    u = ocp.functions.arguments["u"]
+    by_u = ca.jacobian(moved, u)
+    return None if ca.depends_on(by_u, u) else by_u
 
 
 def _along(ocp: OCP, e: ca.SX) -> ca.SX:
@@ -94,15 +112,16 @@ def _along(ocp: OCP, e: ca.SX) -> ca.SX:
     return change + ca.jtimes(e, at["t"], ca.SX(1)) if "t" in at.names else change
 
 
+def _usual_at_once(ocp: OCP, h: ca.SX, by_u: ca.SX) -> float:
+    """The median size of by_u [1, nu] times half of U where U may violate h >= 0; 0 where no control mends that."""
+    least, most, sizes = _over_places(ocp, -_most(ocp, -h, -by_u), _most(ocp, h, by_u), _size(ocp, by_u))
+    short = np.isfinite(least) & np.isfinite(most) & np.isfinite(sizes) & (least < 0)
+    return float(np.median(sizes[short])) if short.any() and (most[short] >= 0).mean() >= MOSTLY else 0.0
+
+
 def _usual(ocp: OCP, h: ca.SX, moved: ca.SX, by_u: ca.SX) -> float:
     """The median size of by_u [1, nu] times half of U where h >= 0 is small; 0 where the control is no sure hold."""
-    s, rng, at = ocp.system, np.random.default_rng(0), ocp.functions.arguments
-    x, u = rng.uniform(s.lbx, s.ubx, (TRIED, s.nx)), rng.uniform(s.lbu, s.ubu, (TRIED, s.nu))
-    size = ca.norm_2(by_u.T * ca.DM((s.ubu - s.lbu) / 2))
-    best = moved + ca.mtimes(by_u, _best(ocp, by_u) - at["u"])
-    tried = at.function("tried", {"h": h, "size": size, "best": best})
-    distance, sizes, most = (ca.DM(value).full().ravel()
-                             for value in tried(*at.columns(x=x, u=u, **ocp.moments(TRIED))))
+    distance, most, sizes = _over_places(ocp, h, _most(ocp, moved, by_u), _size(ocp, by_u))
     fine = np.isfinite(distance) & np.isfinite(sizes) & np.isfinite(most) & (distance >= 0)
     order = np.flatnonzero(fine)[np.argsort(distance[fine])][:max(int(fine.sum()) // 4, 1)]
     if not order.size:
@@ -110,6 +129,25 @@ def _usual(ocp: OCP, h: ca.SX, moved: ca.SX, by_u: ca.SX) -> float:
     usual = float(np.median(sizes[order]))
     sure = sizes[order].min() > SURE * usual and usual > IDLE * sizes[fine].max()
     return usual if sure and (most[order] >= 0).mean() >= MOSTLY else 0.0
+
+
+def _over_places(ocp: OCP, *expressions: ca.SX) -> list[Array]:
+    """The values [TRIED] of each expression [1] over X x U."""
+    s, rng, at = ocp.system, np.random.default_rng(0), ocp.functions.arguments
+    x, u = rng.uniform(s.lbx, s.ubx, (TRIED, s.nx)), rng.uniform(s.lbu, s.ubu, (TRIED, s.nu))
+    tried = at.function("tried", {f"e{i}": e for i, e in enumerate(expressions)})
+    values = tried.call(at.columns(x=x, u=u, **ocp.moments(TRIED)))
+    return [np.broadcast_to(value.full().ravel(), TRIED) for value in values]
+
+
+def _size(ocp: OCP, by_u: ca.SX) -> ca.SX:
+    """How far the half of U moves a row."""
+    return ca.norm_2(by_u.T * ca.DM((ocp.system.ubu - ocp.system.lbu) / 2))
+
+
+def _most(ocp: OCP, moved: ca.SX, by_u: ca.SX) -> ca.SX:
+    """A row under the control that moves it the most."""
+    return moved + ca.mtimes(by_u, _best(ocp, by_u) - ocp.functions.arguments["u"])
 
 
 def _best(ocp: OCP, by_u: ca.SX) -> ca.SX:
@@ -120,7 +158,7 @@ def _best(ocp: OCP, by_u: ca.SX) -> ca.SX:
 
 def steps(ocp: OCP, lasting: float) -> int:
     """How many steps of RK4 a run takes at least where the map is at work."""
-    return math.ceil(max((lasting / _time(row, lasting) for _, row in _rows(ocp)), default=1.0))
+    return math.ceil(max((lasting / _time(row, lasting) for _, row in _rows(ocp) if row.order), default=1.0))
 
 
 def _time(row: Moved, lasting: float) -> float:
@@ -132,39 +170,42 @@ def _time(row: Moved, lasting: float) -> float:
 def braked(ocp: OCP, at: Arguments, v: ca.SX, lasting: float) -> ca.SX:
     """v [nu] moved to where the rows of `guarded` are held, at symbols `at` of a policy: x, t[, p][, dt].
 
-    lasting : how long a run is, in the system's unit of time; s and w are shares of it
+    lasting : how long a run is, in the system's unit of time; s and w are shares of it. 0: where that is not known, or
+        where f is not; rows that the control moves itself are held alone
     """
-    rows = _rows(ocp)
+    rows = _rows(ocp, learned=not lasting)
     if not rows:
         return v
     own, said, dt = ocp.functions.arguments, ca.SX.sym("v", ocp.system.nu), ca.SX.sym("dt")
     wanted = [_wanted(ocp, row, said, ca.fmax(_time(row, lasting), dt)) for _, row in rows]
     u = said
     for _ in range(PASSES if len(wanted) > 1 else 1):
-        for short, by_u, usual in wanted:
-            u = _pushed(ocp, u, said, short, by_u, usual)
+        for short, by_u, flat in wanted:
+            u = _pushed(ocp, u, said, short, by_u, flat)
     moved = own.but("u").function("braked", {"u": ca.cse(u)}, v=said, dt=dt)
     return at.given(v=v, dt=at["dt"] if "dt" in at.names else ca.SX(0)).call(moved)
 
 
 def _wanted(ocp: OCP, row: Moved, v: ca.SX, s: ca.SX) -> tuple[ca.SX, ca.SX, float]:
-    """(what is missing at v, the row's slope by u there, how far U usually moves it)."""
-    u, w = ocp.functions.arguments["u"], WINDOW * s
+    """(what is missing at v, the row's slope by u there, how far U moves it where that is little)."""
+    u, w, flat = ocp.functions.arguments["u"], WINDOW * s, FLAT[row.order] * row.usual
     by_u, got = (ca.substitute(e, u, v) for e in (ca.jacobian(row.moved, u), row.moved))
+    if row.order == 0:
+        return -got, by_u, flat
     if row.order == 1:
-        return -ca.fmax(row.h, 0) / s - ca.fmin(row.h, 0) / w - got, by_u, row.usual
+        return -ca.fmax(row.h, 0) / s - ca.fmin(row.h, 0) / w - got, by_u, flat
     most = got + ca.mtimes(by_u, _best(ocp, by_u) - v)
     closing = ca.fmin(row.slope, 0)
     stop = closing**2 / (ca.fmax(2 * row.h, -s * closing) + NOTHING)
     spare = ca.fmax(1 - stop / (RESERVE * ca.fmax(most, IDLE * row.usual)), 0)
-    return stop - spare * (ca.fmax(row.h, 0) / w**2 - closing / w) - ca.fmin(row.h, 0) / w**2 - got, by_u, row.usual
+    return stop - spare * (ca.fmax(row.h, 0) / w**2 - closing / w) - ca.fmin(row.h, 0) / w**2 - got, by_u, flat
 
 
-def _pushed(ocp: OCP, u: ca.SX, v: ca.SX, missing: ca.SX, by_u: ca.SX, usual: float) -> ca.SX:
+def _pushed(ocp: OCP, u: ca.SX, v: ca.SX, missing: ca.SX, by_u: ca.SX, flat: float) -> ca.SX:
     """u changed, as little as needed in halves of U, by what is missing at v; where that leaves U, the rest is made up
     on the way to the control that moves the row the most."""
     s = ocp.system
-    half, small = ca.DM(((s.ubu - s.lbu) / 2) ** 2), (FLAT * usual) ** 2
+    half, small = ca.DM(((s.ubu - s.lbu) / 2) ** 2), flat**2
     short = ca.fmax(missing - ca.mtimes(by_u, u - v), 0)
     step = half * by_u.T * short / (ca.mtimes(by_u, half * by_u.T) + small)
     moved = retracted(ocp, ca.fmin(ca.fmax(u + step, ca.DM(s.lbu)), ca.DM(s.ubu)))

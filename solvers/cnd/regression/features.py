@@ -190,7 +190,7 @@ def policy_net(ocp: OCP, labels: Labels, sizes: tuple[int, ...], control_dt: boo
                own: ca.Function | None = None, branches: int = 1,
                lasting: float = 0.0) -> tuple[FeatureNet, ca.Function]:
     """(u = clip(mean + spread * y, U), y a tanh network of the features; and u -> y, its inverse inside U). Constraints
-    of u alone are held on top (projection.py), and with `lasting`, how long a run is, those of states that can be
+    of u are held on top (projection.py), and with `lasting`, how long a run is, those of states that can be
     (barrier.py).
 
     control_dt: (x, t[, p], dt) -> u in place of (x, t[, p]) -> u. own: further features. With `branches` > 1 the
@@ -213,8 +213,7 @@ def net_on(ocp: OCP, phi: ca.Function, labels: Labels, sizes: tuple[int, ...], b
 
     said_u = _blended(y, s.nu, branches, clipped)
     at = Arguments.of(phi)
-    held_u = braked(ocp, at, said_u, lasting) if lasting else said_u
-    outputs = at.function("controls", {"u": retracted(ocp, held_u)}, y=y)
+    outputs = at.function("controls", {"u": retracted(ocp, braked(ocp, at, said_u, lasting))}, y=y)
     net = FeatureNet(phi, [MLP([phi.numel_out(0), *sizes, said])], outputs)
     return net, ca.Function("inverse", [u], [(u - mean) / spread], ["u"], ["y"])
 
