@@ -118,6 +118,27 @@ def test_a_limit_that_the_control_moves_at_once_is_held_as_it_stands(lasting):
     assert not Held(ocp, learned=not lasting).first.any()
 
 
+def with_a_budget(lowest: float) -> OCP:
+    """x' = u - x, and what u amounts to is at most 1 at the end; u in [lowest, 2]."""
+    x, spent, u = (ca.SX.sym(name) for name in ("x", "spent", "u"))
+    system = nocl.System("tap", x=ca.vertcat(x, spent), u=u, xdot=ca.vertcat(u - x, u), lbu=[lowest], ubu=[2],
+                         lbx=[-1, 0], ubx=[1, 2])
+    return OCP(system, horizon=4.0, running=(x - 1)**2, terminal=0.0, terminal_constraints={"budget": (None, spent, 1)},
+               initial_states=nocl.Uniform([-0.3, 0], [0.3, 0.2]))
+
+
+def test_a_budget_at_the_end_is_held_all_along_where_nothing_comes_back():
+    ocp = with_a_budget(0.0)
+    x0 = ocp.initial_states.sample(20, 0)
+    runs = [nocl.simulate(ocp, wild(ocp, seed, 20.0), x0, nodes=81) for seed in range(4)]
+    assert max(run.violation.max() for run in runs) <= TOLERANCE
+    assert max(run.x[:, -1, 1].max() for run in runs) > 0.99  # all of it is used
+    assert not Held(ocp).first.any()
+    for other, learned in ((with_a_budget(-1.0), False), (with_a_budget(0.1), False), (ocp, True)):
+        assert not guarded(other, learned).any()
+        assert (Held(other, learned).first > 0).all()
+
+
 def car(xdot, wall, fastest: float = 2.0) -> OCP:
     """A problem on (x, v) under u [1] with a constraint."""
     x, v, u = (ca.SX.sym(name) for name in "xvu")

@@ -60,7 +60,7 @@ class Held:
     @cached_property
     def guarded(self) -> Any:
         """Which rows of states the output map holds."""
-        return np.r_[guarded(self.ocp, self.learned), np.zeros(len(self.ocp.functions.end_rows), dtype=bool)]
+        return guarded(self.ocp, self.learned)
 
     @cached_property
     def scales(self) -> Array:

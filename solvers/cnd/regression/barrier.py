@@ -10,7 +10,8 @@ a track, is held by (control barrier functions: Ames et al., IEEE TAC 62(8), 201
     h' >= -h / s                                            (first derivative)
     h'' >= b - (1 - b / (r B)) (h / w^2 - h' / w)           (second; terms of h' where h' < 0, and 1 - ... where > 0)
 
-and one h(x, u, t, p) >= 0 that it moves itself, as a limit of power, as it stands, on learned dynamics too.
+and one h(x, u, t, p) >= 0 that it moves itself, as a limit of power, as it stands, on learned dynamics too. A row at the
+end of what is only ever used up, as a dose, holds all along, and is held so.
 
 b = h'^2 / (2 h) is the constant braking that stops at the boundary; a run that touches the boundary tends to it by
 itself. The other term lets braking be less while there is time, w, and while it takes less than a share r of B, the
@@ -62,18 +63,24 @@ class Moved(NamedTuple):
 
 
 def guarded(ocp: OCP, learned: bool = False) -> NDArray[np.bool_]:
-    """Which rows along a trajectory [m] the map holds: inequalities that the control moves soon enough, at once where
-    the dynamics are `learned`, and that are not of the control alone (projection.py)."""
-    found = np.zeros(len(ocp.functions.rows), dtype=bool)
+    """Which rows along a trajectory and at its end [m + those at the end] the map holds: inequalities that the control
+    moves soon enough, at once where the dynamics are `learned`, and that are not of the control alone (projection.py).
+    """
+    found = np.zeros(len(ocp.functions.rows) + len(ocp.functions.end_rows), dtype=bool)
     found[[i for i, _ in _rows(ocp, learned)]] = True
     return found
 
 
 def _rows(ocp: OCP, learned: bool = False) -> list[tuple[int, Moved]]:
     """Such rows by number; where the equations of motion are not known, and in discrete time, those moved at once."""
-    rows, blind = ocp.functions.rows, learned or ocp.system.xdot is None or ocp.system.is_discrete
-    mine = ~rows.equal & ~projected(ocp) & (rows.of_u | (not blind))
-    moved = [(int(i), _at_once(ocp, int(i)) if rows.of_u[i] else _moved(ocp, int(i))) for i in np.flatnonzero(mine)]
+    of, m = ocp.functions, len(ocp.functions.rows)
+    mine = ~of.rows.equal & ~projected(ocp)
+    moved = [(int(i), _at_once(ocp, int(i))) for i in np.flatnonzero(mine & of.rows.of_u)]
+    if not (learned or ocp.system.xdot is None or ocp.system.is_discrete):
+        moved += [(int(i), _moved(ocp, of.rows.column[int(i)] / float(of.scales[i])))
+                  for i in np.flatnonzero(mine & ~of.rows.of_u)]
+        moved += [(m + int(i), _budget(ocp, of.end_rows.column[int(i)] / float(of.end_scales[i])))
+                  for i in np.flatnonzero(~of.end_rows.equal)]
     return [(i, row) for i, row in moved if row is not None]
 
 
@@ -85,10 +92,10 @@ def _at_once(ocp: OCP, i: int) -> Moved | None:
     return Moved(h, ca.SX(0), h, 0, usual) if usual > 0 else None
 
 
-def _moved(ocp: OCP, i: int) -> Moved | None:
-    """The first or second derivative of row i along f that the control moves; None where the map cannot hold it so."""
-    of = ocp.functions
-    h, at = of.rows.column[i] / float(of.scales[i]) + TOLERANCE / 2, of.arguments
+def _moved(ocp: OCP, c: ca.SX) -> Moved | None:
+    """The first or second derivative of a row c along f that the control moves; None where the map cannot hold it so.
+    """
+    h, at = c + TOLERANCE / 2, ocp.functions.arguments
     slope = _along(ocp, h)
     for order, moved in ((1, slope), (2, _along(ocp, slope))):
         if ca.depends_on(moved, at["u"]):
@@ -96,6 +103,15 @@ def _moved(ocp: OCP, i: int) -> Moved | None:
             usual = 0.0 if by_u is None else _usual(ocp, h, moved, by_u)
             return Moved(h, slope, moved, order, usual) if usual > 0 else None
     return None
+
+
+def _budget(ocp: OCP, c: ca.SX) -> Moved | None:
+    """A row at the end of what is used up and never comes back, as fuel or a dose: it holds all along."""
+    row = _moved(ocp, c)
+    if row is None or row.order != 1:
+        return None
+    most, = _over_places(ocp, _most(ocp, row.moved, ca.jacobian(row.moved, ocp.functions.arguments["u"])))
+    return row if np.isfinite(most).all() and most.max() <= IDLE * row.usual else None
 
 
 def _by_u(ocp: OCP, moved: ca.SX) -> ca.SX | None:
