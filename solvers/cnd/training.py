@@ -452,7 +452,8 @@ class Training:
             self.net, self.inverse = policy_net(self.ocp, self.labels[: self.first], self.settings.hidden,
                                                 self.settings.control_dt, self.own, self.settings.branches,
                                                 0.0 if self.learned else self.ocp.longest)
-        self.policy = Rolled(at_rate(self.net, 0.0) if self.settings.control_dt else self.net)  # in continuous time
+        acting = at_rate(self.net, 0.0) if self.settings.control_dt else self.net  # in continuous time
+        self.policy = Rolled(acting, self.in_torch)
 
     def _rehearse_export(self) -> None:
         """Warns, before the long part, where CasADi does not answer as the policy does."""

@@ -27,7 +27,7 @@ class InTorch:
     """
 
     def __init__(self, ocp: OCP, dynamics: Function | None = None, integrator: str = RK4) -> None:
-        self.ocp, self.timed = ocp, ocp.uses_time
+        self.ocp, self.timed, self.dynamics = ocp, ocp.uses_time, dynamics
         self.implicit = Implicit(ocp, dynamics is not None) if integrator == RADAU else None
         names = ocp.functions.arguments.names
         self.takes = {"f": names if dynamics is None else ocp.system.arguments.names, "L": names,

@@ -16,6 +16,7 @@ from nocl.definition.discrete import samples
 from nocl.definition.ocp import OCP
 from nocl.definition.sampling import Uniform, box
 from nocl.solvers.cnd.regression.in_torch import InTorch
+from nocl.solvers.cnd.regression.rolled import Rolled
 from nocl.solvers.ddp.bank import Rows, SolutionBank, better, extend
 from nocl.solvers.ddp.solver import DDP
 from nocl.support.checks import Array
@@ -300,6 +301,8 @@ def continuous_run(policy: Policy, torch_ocp: InTorch, at: Problems, steps: int)
     """
     if torch_ocp.ocp.system.is_discrete:
         return stepped_run(policy, torch_ocp, at)
+    if isinstance(policy, Rolled) and policy.loop is not None and policy.loop.of is torch_ocp:
+        return policy.loop(at.x, at.t, at.p, steps)
     n, here, steps_of = at.x.shape[1], torch_ocp.at(at.p), torch_ocp.implicit
 
     def closed_loop(z: Tensor, _: None) -> Tensor:
