@@ -18,8 +18,8 @@ x, v, u, k, t = ca.SX.sym("x"), ca.SX.sym("v"), ca.SX.sym("u"), nocl.parameter("
 
 def spring() -> nocl.OCP:
     """x'' = u - k x + sin t."""
-    system = nocl.System("spring", x=ca.vertcat(x, v), u=u, p=k, xdot=ca.vertcat(v, u - k * x + ca.sin(t)), lbu=[-2], ubu=[2],
-                         lbx=[-2, -2], ubx=[2, 2])
+    system = nocl.System("spring", x=ca.vertcat(x, v), u=u, p=k, xdot=ca.vertcat(v, u - k * x + ca.sin(t)), lbu=[-2],
+                         ubu=[2], lbx=[-2, -2], ubx=[2, 2])
     return nocl.OCP(system, horizon=3.0, running=k * x**2 + u**2 + t * v**2, terminal=k * x**2,
                     initial_states=nocl.Uniform([-1, -1], [1, 1]), parameters=nocl.Uniform([0.5], [2.0]))
 

@@ -10,8 +10,8 @@ a track, is held by (control barrier functions: Ames et al., IEEE TAC 62(8), 201
     h' >= -h / s                                            (first derivative)
     h'' >= b - (1 - b / (r B)) (h / w^2 - h' / w)           (second; terms of h' where h' < 0, and 1 - ... where > 0)
 
-and one h(x, u, t, p) >= 0 that it moves itself, as a limit of power, as it stands, on learned dynamics too. A row at the
-end of what is only ever used up, as a dose, holds all along, and is held so.
+and one h(x, u, t, p) >= 0 that it moves itself, as a limit of power, as it stands, on learned dynamics too. A row at
+the end of what is only ever used up, as a dose, holds all along, and is held so.
 
 b = h'^2 / (2 h) is the constant braking that stops at the boundary; a run that touches the boundary tends to it by
 itself. The other term lets braking be less while there is time, w, and while it takes less than a share r of B, the

@@ -7,21 +7,19 @@ operations of a step takes some microseconds, however few rows there are.
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import casadi as ca
 import numpy as np
 import torch
 
-from nocl.nets import FeatureNet
+from nocl.nets import MLP, FeatureNet
 from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.ddp.kernel import ACTIVATION_KINDS, pack_weights
 from nocl.support.checks import Array
 from nocl.support.compiler import CompilerError, NoCompilerError
 from nocl.support.pool import cores
 from nocl.translate.kernels import Kernel, emit
-
-
 
 
 class ClosedLoop:
@@ -80,11 +78,12 @@ def _source(net: FeatureNet, of: InTorch, f_net: FeatureNet | None) -> str:
 
 def _network(name: str, net: FeatureNet, args: list[ca.SX], given: list[ca.SX]) -> str:
     """C of `name(weights, i0[, i1], out)`, the network at symbols `args` as functions of `given`."""
-    phi, y = _outputs(net.inputs, args), [ca.SX.sym(f"y{g}", mlp.sizes[-1]) for g, mlp in enumerate(net.nets)]
+    nets = cast(list[MLP], list(net.nets))
+    phi, y = _outputs(net.inputs, args), [ca.SX.sym(f"y{g}", mlp.sizes[-1]) for g, mlp in enumerate(nets)]
     said = ca.densify(net.outputs(*args, *y))
     inputs = [f"i{i}" for i in range(len(given))]
     lines, weight = list[str](), 1
-    for g, mlp in enumerate(net.nets):
+    for g, mlp in enumerate(nets):
         widest, skip = max(mlp.sizes), int(mlp.skip is not None)
         shape, kind = f"(const int[]){{{', '.join(map(str, mlp.sizes))}}}", ACTIVATION_KINDS[mlp.activation]
         lines += [f"    lane phi{g}[{mlp.sizes[0]}], a{g}[{widest}], b{g}[{widest}], y{g}[{mlp.sizes[-1]}];",
