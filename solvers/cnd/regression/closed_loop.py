@@ -7,7 +7,7 @@ operations of a step takes some microseconds, however few rows there are.
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any, cast
+from typing import cast
 
 import casadi as ca
 import numpy as np
@@ -79,7 +79,7 @@ def _source(net: FeatureNet, of: InTorch, f_net: FeatureNet | None) -> str:
 def _network(name: str, net: FeatureNet, args: list[ca.SX], given: list[ca.SX]) -> str:
     """C of `name(weights, i0[, i1], out)`, the network at symbols `args` as functions of `given`."""
     nets = cast(list[MLP], list(net.nets))
-    phi, y = _outputs(net.inputs, args), [ca.SX.sym(f"y{g}", mlp.sizes[-1]) for g, mlp in enumerate(nets)]
+    phi, y = net.inputs.call(args), [ca.SX.sym(f"y{g}", mlp.sizes[-1]) for g, mlp in enumerate(nets)]
     said = ca.densify(net.outputs(*args, *y))
     inputs = [f"i{i}" for i in range(len(given))]
     lines, weight = list[str](), 1
@@ -96,8 +96,3 @@ def _network(name: str, net: FeatureNet, args: list[ca.SX], given: list[ca.SX]) 
     return "\n".join([*(emit(f"{name}_features{g}", given, [ca.densify(one)]) for g, one in enumerate(phi)),
                       emit(f"{name}_answer", [*given, *y], [said]),
                       head, "{", *lines, f"    {name}_answer({answers}, out);", "}", ""])
-
-
-def _outputs(function: ca.Function, args: list[Any]) -> list[ca.SX]:
-    found = function(*args)
-    return list(found) if isinstance(found, tuple) else [found]
