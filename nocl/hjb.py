@@ -18,6 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from nocl.translate.implicit import RadauStep
 from nocl.translate.rk4 import rk4, rk4_cost
 
 Map = Callable[..., Tensor]  # of one or two tensors of rows
@@ -62,7 +63,8 @@ def rollout(policy: Map, dynamics: Map, L: Map, x0: Tensor, T: float, K: int, *,
     """Trajectories from x0 [B, nx] over [t0, T] in K equal steps.
 
     With `hold` the policy is asked at each node and held over the step, which `step` makes. Without, it is feedback in
-    continuous time: it stands inside the ODE, which RK4 solves, and is asked at each of the four stages.
+    continuous time: it stands inside the ODE, which RK4 solves, or a RadauStep where that is the step, and is asked at
+    each stage.
     Differentiable in whatever policy, dynamics, L and x0 depend on. More batch dimensions may stand in place of B.
     """
     h, x, column = (T - t0) / K, x0, (*x0.shape[:-1], 1)
@@ -70,7 +72,12 @@ def rollout(policy: Map, dynamics: Map, L: Map, x0: Tensor, T: float, K: int, *,
     for k in range(K):
         t = x0.new_full(column, t0 + k * h)
         u = policy(x, t)
-        x, cost = step(dynamics, L, x, u, h) if hold else _feedback_step(policy, dynamics, L, x, u, t, h)
+        if hold:
+            x, cost = step(dynamics, L, x, u, h)
+        elif isinstance(step, RadauStep):
+            x, cost = step.fed_back(policy, dynamics, L, x, t, h)
+        else:
+            x, cost = _feedback_step(policy, dynamics, L, x, u, t, h)
         running = running + cost
         states.append(x)
         controls.append(u)

@@ -10,7 +10,8 @@ departs from it because the plain recipe fails, is a field of `PaperSettings`, a
 - near_goal (off): on the quadrotor, U = [-100, 100]^4, random controllers spin the body up within the horizon: costs
   of 10^5 and gradients that point nowhere. Started at u*, with a smaller learning rate, it learns to fly.
 - sin_cos: angles go in as sin and cos too, so that u is periodic where it should be.
-- rollouts are RK4 with the controller inside the ODE. With hold=True they are nocl's discretisation for NMPC, several
+- rollouts are RK4, or implicit steps where f is stiff, with the controller inside the ODE. With hold=True they are
+  nocl's discretisation for NMPC, several
   times as fast (the race's always are), but then the controller is one for that control rate: trained at 12.5 Hz to
   cost 0.106, cart-pole's has 0.67 in continuous time; trained inside the ODE, 0.147 in a quarter of the iterations.
   step="euler" with hold=True is the published code.
@@ -23,6 +24,7 @@ from __future__ import annotations
 import copy
 import math
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -36,14 +38,19 @@ from torch.func import functional_call, stack_module_state
 
 from nocl import hjb
 from nocl.definition.ocp import OCP
+from nocl.definition.scales import usual_sizes
+from nocl.definition.substeps import RADAU, RK4, STABLE
 from nocl.nets import MLP, FeatureNet
 from nocl.solvers.cnd.lifted import Lifted
-from nocl.solvers.cnd.settings import STEPS, PaperSettings, identity
+from nocl.solvers.cnd.settings import AUTO, STEPS, PaperSettings, identity
+from nocl.solvers.grid import fastest_at_start
 from nocl.support import store
 from nocl.support.checks import Array
 from nocl.support.progress import bar as progress_bar
 from nocl.translate.arguments import Arguments
 from nocl.translate.fused import FusedStep
+from nocl.translate.implicit import RadauStep
+from nocl.translate.radau import STAGES
 from nocl.translate.torch_functions import to_torch
 
 __all__ = ["PaperSettings", "train_paper"]
@@ -126,6 +133,7 @@ def train_paper(ocp: OCP, dynamics: Any = None, settings: PaperSettings | None =
     card = {"method": "paper", "settings": asdict(settings), "seed": seed, "dtype": str(dtype).removeprefix("torch."),
             "dynamics": "exact" if dynamics is None else "learned", "race": run.race, "race_seconds": run.race_seconds,
             "seconds": run.seconds, "dynamics_evaluations": trainer.evaluations, "iterations": len(run.rows),
+            "step": trainer.kind,
             "history": {name: [row[i] for row in run.rows] for i, name in enumerate(TERMS)},
             "best_iteration": run.best.iteration, "held_out_cost": run.best.cost}
     return policy.to("cpu", torch.float64).eval(), value.to("cpu", torch.float64).eval(), card
@@ -142,8 +150,9 @@ class Trainer:
         self.progress = progress
         self.f = _torch_dynamics(ocp, dynamics, device, dtype)
         self.L, self.G = to_torch(ocp.L_soft), to_torch(ocp.G)
-        fused = settings.fused and settings.step == "rk4" and dynamics is None and torch.device(device).type == "cpu"
-        self.step = _fused(ocp) if fused else STEPS[settings.step]
+        self.kind = _kind(ocp, dynamics, settings)
+        fused = settings.fused and self.kind == RK4 and dynamics is None and torch.device(device).type == "cpu"
+        self.step = _fused(ocp) if fused else RadauStep(usual_sizes(ocp).x) if self.kind == RADAU else STEPS[self.kind]
         self.rng = np.random.default_rng(seed)
         self.evaluations = 0  # of f, one for each state and control
         with torch.random.fork_rng(devices=[]):
@@ -157,9 +166,12 @@ class Trainer:
         return torch.as_tensor(x0, dtype=self.dtype, device=self.device)
 
     def rollout(self, policy: hjb.Map, x0: Tensor, hold: bool) -> hjb.Rollout:
-        K = self.settings.intervals
-        self.evaluations += math.prod(x0.shape[:-1]) * K * (1 if self.settings.step == "euler" else 4)
-        return hjb.rollout(policy, self.f, self.L, x0, self.ocp.horizon, K, step=self.step, hold=hold)
+        K, T, step = self.settings.intervals, self.ocp.horizon, self.step
+        before = step.evaluations if isinstance(step, RadauStep) else 0
+        path = hjb.rollout(policy, self.f, self.L, x0, T, K, step=step, hold=hold)
+        self.evaluations += step.evaluations - before if isinstance(step, RadauStep) else \
+            math.prod(x0.shape[:-1]) * K * (1 if self.kind == "euler" else 4)
+        return path
 
     def costs(self, policy: hjb.Map, x0: Tensor, hold: bool) -> Tensor:
         """The cost of each trajectory."""
@@ -324,6 +336,22 @@ def _torch_dynamics(ocp: OCP, dynamics: Any, device: str | torch.device, dtype: 
         raise ValueError(f"dynamics is a {type(dynamics).__name__}; expected None (the exact f), a LearnedDynamics, or "
                          "a torch callable (x [B, nx], u [B, nu]) -> xdot [B, nx]")
     return net
+
+
+def _kind(ocp: OCP, dynamics: Any, settings: PaperSettings) -> str:
+    """Of the steps of rollouts. Told where they are implicit without having been asked for."""
+    if settings.step != AUTO:
+        return settings.step
+    known = dynamics is None and ocp.system.xdot is not None
+    if not known and not hasattr(dynamics, "to_casadi"):
+        return RK4
+    step = ocp.horizon / settings.intervals
+    shortest = fastest_at_start(ocp, ocp.functions if dynamics is None else ocp.functions.on(dynamics.to_casadi()))
+    if step <= STABLE * shortest:
+        return RK4
+    warnings.warn(f"{ocp.system.name}: fastest mode {shortest:.3g} s, step {step:.3g} s: implicit Radau, {STAGES} "
+                  "stages, in rollouts; PaperSettings(step=) decides it", stacklevel=4)
+    return RADAU
 
 
 def _fused(ocp: OCP) -> hjb.Step:

@@ -11,7 +11,7 @@ import torch
 
 from nocl import hjb
 from nocl.definition.ocp import OCP
-from nocl.definition.substeps import INTEGRATORS, USUAL
+from nocl.definition.substeps import INTEGRATORS, RADAU, USUAL
 from nocl.nets import ACTIVATIONS, FeatureNet
 from nocl.support import checks
 from nocl.support.fields import Checked, Scaled, choice, coefficients, count, flag, nonnegative, positive, widths
@@ -116,7 +116,9 @@ class PaperSettings(Checked):
                                        none="weights as random as the others'")
     sin_cos: bool = flag(True, "sin and cos of declared angles as inputs, beside their values")
     intervals: int = count(40, "K: steps of a rollout")
-    step: str = choice("rk4", "of a rollout; 'euler' as published", STEPS)
+    step: str = choice(AUTO, "of a rollout: 'rk4'; 'euler' as published; 'radau', implicit ones; auto: 'rk4', or "
+                       "'radau' where f is so fast at initial states that Runge-Kutta's would be unstable",
+                       (AUTO, *STEPS, RADAU))
     hold: bool = flag(False, "False: feedback inside RK4's stages, as in a neural ODE; True: held over intervals")
     fused: bool = flag(True, "held RK4 steps of the exact f as compiled C on the CPU; False: in torch, same gradients")
     iterations: int = count(1000, "of Adam, after the race")
@@ -136,9 +138,9 @@ class PaperSettings(Checked):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not self.hold and self.step != "rk4":
-            raise ValueError(f"PaperSettings: step is {self.step!r} with hold=False; expected step='rk4', which "
-                             "feedback in continuous time is integrated by")
+        if not self.hold and self.step == "euler":
+            raise ValueError(f"PaperSettings: step is {self.step!r} with hold=False; expected step='rk4', 'radau' or "
+                             "'auto', which feedback in continuous time is integrated by")
 
 
 def identity(ocp: OCP, settings: Any, seed: int, f: Any, **more: str) -> str:
