@@ -47,7 +47,7 @@ def test_a_step_is_casadis_and_so_are_its_derivatives():
 
 
 def test_under_a_policy_it_is_the_closed_loop_and_its_gradient_that_of_finite_differences():
-    ocp, f, L, step = problem()
+    _, f, L, step = problem()
     x0, gain = torch.tensor([[2.0, 0.0], [1.6, 0.5]], dtype=torch.float64), torch.tensor([3.0, 0.2], requires_grad=True,
                                                                                       dtype=torch.float64)
 
