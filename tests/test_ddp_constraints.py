@@ -4,6 +4,7 @@ import pickle
 import re
 from dataclasses import replace
 from functools import lru_cache
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -403,9 +404,9 @@ def test_rows_are_the_problems_own():
     assert (again.constraints, again.between, again.held) == ("elastic", True, 21)
 
 
-@pytest.mark.parametrize("mu", [0.0, 3.0])
+@pytest.mark.parametrize(("mu", "bend"), [(0.0, 1.0), (3.0, 0.0), (3.0, 1.0)])
 @pytest.mark.parametrize("name", ["point", "planes"])
-def test_numpy_computes_what_the_kernel_does(name, mu):
+def test_numpy_computes_what_the_kernel_does(name, mu, bend):
     of = random_half_planes() if name == "planes" else problem(name)
     ocp, K, B, rng = of.ocp, 8, 5, np.random.default_rng(4)
     s, results = ocp.system, []
@@ -418,8 +419,9 @@ def test_numpy_computes_what_the_kernel_does(name, mu):
             d.kernel = NumpyKernel(ocp, None, 1, of.rows)
         work = augmented.Augmented(d, ocp.initial_states.sample(B, 0), np.zeros(B), u, None, None, p)
         work.mu[:], work.y[:], work.margin = mu, y, margin
-        work.penalty[:] = np.array([[3.0, np.inf, 0, np.inf], [50, np.inf, 0, np.inf], [3, 0.4, 0, 0.7],
-                                    [3, 0.4, 1e3, 0.2], [9, np.inf, 1e6, np.inf]])
+        work.penalty[:, :4] = np.array([[3.0, np.inf, 0, np.inf], [50, np.inf, 0, np.inf], [3, 0.4, 0, 0.7],
+                                        [3, 0.4, 1e3, 0.2], [9, np.inf, 1e6, np.inf]])
+        work.penalty[:, 4] = bend
         V, V_x, V_xx = np.zeros((B, K + 1)), np.zeros((B, K + 1, s.nx)), np.zeros((B, K + 1, s.nx, s.nx))
         V_p = np.zeros((B, ocp.np)) if ocp.np else None
         work.backward(np.arange(B), V, V_x, V_xx, V_p)
@@ -429,7 +431,7 @@ def test_numpy_computes_what_the_kernel_does(name, mu):
         first = [work.J.copy(), work.parts.copy()]
         work._next_round(np.arange(B), np.arange(B) % 2 == 0)
         results.append([V, V_x, V_xx, work.k, work.gain, work.slope, work.curve, work.positive, work.c, *first, work.y,
-                        work.penalty, work.J, work.parts, *([V_p] if ocp.np and mu == 0 else [])])
+                        work.penalty, work.J, work.parts, *([V_p] if ocp.np and bend else [])])
     sound = results[0][7] > 0
     assert sound.any()
     assert np.array_equal(results[0][7], results[1][7])
@@ -466,3 +468,16 @@ def test_every_kind_of_constraint_as_nmpc_holds_it():
     np.testing.assert_allclose(ddp.V_x[:, 0], nmpc.costate[:, 0], rtol=1e-4, atol=1e-5)
     assert np.abs(ddp.x[:, -1]).max() < 1e-8
     assert (ddp.x[:, :, 1].min(axis=1) < -0.72 + 1e-6).any()  # it is active
+
+
+def test_what_bends_only_by_the_equations_is_damped_with_second_derivatives():
+    """A Mayer problem: without second derivatives of f there are none, and the descent crawls."""
+    ocp = nocl.load_ocp(Path(__file__).resolve().parents[1] / "examples" / "orbit_transfer.py")
+    ddp = DDP(ocp, intervals=40, substeps=1)
+    ddp.checked = True
+    s = ddp.solve(ocp.initial_states.sample(4, np.random.default_rng(1)))
+    assert s.success.all(), s.message
+    assert s.iterations.max() < 200
+    nmpc = NMPC(ocp, 40, substeps=1, passes=0).solve(s.x[:, 0], s, workers=1)
+    np.testing.assert_allclose(s.cost, nmpc.cost, rtol=1e-7)
+    np.testing.assert_allclose(s.V_x[:, 0], nmpc.costate[:, 0], rtol=1e-5, atol=1e-6)

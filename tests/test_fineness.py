@@ -1,10 +1,13 @@
 """How many intervals training's plans get: as many as bring what they cost, followed, near the optimum."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import nocl
+from nocl.solvers.cnd import fineness
 from nocl.solvers.cnd.fineness import WORTH, _floor, intervals_for
 from nocl.solvers.cnd.settings import TrainSettings
 from nocl.solvers.cnd.training import _steps
@@ -23,6 +26,12 @@ def test_plans_get_as_many_intervals_as_they_need(name, intervals):
     assert _floor(ocp, None, intervals, steps(ocp)(intervals)) <= WORTH
     if intervals > 80:
         assert _floor(ocp, None, intervals // 2, steps(ocp)(intervals // 2)) > WORTH
+
+
+def test_where_nothing_is_solved_on_a_finer_grid_nothing_is_known(monkeypatch):
+    ocp = nocl.load_ocp("pendulum")
+    monkeypatch.setattr(fineness, "solved_again", lambda _, s: replace(s, success=np.zeros(len(s), dtype=bool)))
+    assert intervals_for(ocp, None, steps(ocp)) == 80
 
 
 def test_training_takes_them_unless_it_is_told(monkeypatch):

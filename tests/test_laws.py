@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from nocl.solvers.cnd.laws import Switches, law_advice
 from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.cnd.regression.labels import Labels
 from nocl.solvers.cnd.settings import TrainSettings
+from nocl.solvers.cnd.validate import over
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.nodes import NodeBank
 
@@ -113,6 +116,13 @@ def test_a_minimum_time_law_takes_nearly_the_least_time(tmp_path):
     again = nocl.CND.load(tmp_path)
     np.testing.assert_array_equal(again(fresh), cnd(fresh))
     np.testing.assert_allclose(cnd.to_casadi()(fresh.T, 0.0).full().T, cnd(fresh), atol=1e-12)
+
+
+def test_who_gains_less_is_above_the_optimum_and_who_fails_is_worst(bank):
+    """J* may be a gain: a law that gains half of it costs half of |J*| more, and one that is lost all."""
+    best = replace(bank.solution[:3], cost=np.array([-4.0, 4.0, np.inf]), success=np.array([True, True, False]))
+    np.testing.assert_allclose(over(np.array([-2.0, 5.0, 1.0]), best), [0.5, 0.25])
+    assert (over(np.full(3, np.inf), best) == np.inf).all()
 
 
 def test_what_is_missing_of_a_law_is_said():

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import nocl
+from nocl.definition.scales import usual_sizes
 from nocl.solvers import DDP, LQR, NMPC
 from nocl.solvers.cnd.regression.features import features
 from nocl.solvers.cnd.regression.labels import Labels
@@ -124,3 +125,15 @@ def test_equilibria_are_found_in_any_unit(scale):
 
     assert of(scale) == of(1.0)
     assert len(of(1.0)) > 1
+
+
+def test_without_a_goal_costs_are_as_large_as_what_they_differ_by():
+    """The farthest in a second: it begins at no cost, and where 0 is decides nothing."""
+    def size(k=1.0, base=0.0):
+        p, u = ca.SX.sym("p"), ca.SX.sym("u")
+        system = nocl.System("far", x=p, u=u, xdot=u, lbu=[0], ubu=[50], lbx=[-1], ubx=[99])
+        return usual_sizes(nocl.OCP(system, horizon=1.0, running=0.0, terminal=k * (base - p),
+                                    initial_states=nocl.Uniform([0], [0]))).cost
+
+    assert 25 < size() < 40  # the mean distance of two points in X is a third of its width
+    np.testing.assert_allclose([size(1e6) / 1e6, size(1.0, 1e4)], size(), rtol=1e-9)

@@ -23,19 +23,39 @@ class Sizes:
 
     x: Array  # [nx], half the widths of X
     u: Array  # [nu], of U
-    cost: float  # of staying where one begins, under any control
+    cost: float  # of staying where one begins, under any control; without a goal what it differs by all over X
 
 
 @lru_cache(maxsize=32)
 def usual_sizes(ocp: OCP) -> Sizes:
-    s, rng = ocp.system, own_numbers(0)
-    x = np.clip(ocp.initial_states.sample(SAMPLES, rng), s.lbx, s.ubx)  # far outside X costs are not usual
-    u = rng.uniform(s.lbu, s.ubu, (SAMPLES, s.nu))
+    s = ocp.system
+    costs = (_staying(ocp),) if ocp.has_goal else (_differences(ocp), _staying(ocp))
+    known = (J[np.isfinite(J) & (J > 0)] for J in costs)
+    cost = next((float(np.median(J)) for J in known if J.size), 1.0)
+    return Sizes((s.ubx - s.lbx) / 2, (s.ubu - s.lbu) / 2, cost)
+
+
+def _staying(ocp: OCP) -> Array:
+    """|J| of staying where one begins [SAMPLES]."""
+    rng = own_numbers(0)
+    x = np.clip(ocp.initial_states.sample(SAMPLES, rng), ocp.system.lbx, ocp.system.ubx)  # far out costs are not usual
+    return np.abs(np.stack(_parts(ocp, x, rng))).sum(axis=0)
+
+
+def _differences(ocp: OCP) -> Array:
+    """|J - J'| of staying anywhere in X, pair by pair: what is made of a state that may begin at no cost, or at a
+    large one, of which all but a little stays as it is."""
+    rng = own_numbers(0)
+    J = sum(_parts(ocp, rng.uniform(ocp.system.lbx, ocp.system.ubx, (SAMPLES, ocp.system.nx)), rng))
+    return np.abs(J[::2] - J[1::2])
+
+
+def _parts(ocp: OCP, x: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    """T L and G of staying at x [SAMPLES, nx] under any control."""
+    u = rng.uniform(ocp.system.lbu, ocp.system.ubu, (SAMPLES, ocp.system.nu))
     of, at = ocp.functions, ocp.moments(SAMPLES)
-    L, G = (g(*a.columns(x=x, u=u, **at)).full() for g, a in ((of.L, of.arguments), (of.G, of.end)))
-    J = np.abs(ocp.longest * L) + np.abs(G)
-    J = J[np.isfinite(J) & (J > 0)]
-    return Sizes((s.ubx - s.lbx) / 2, (s.ubu - s.lbu) / 2, float(np.median(J)) if J.size else 1.0)
+    L, G = (g(*a.columns(x=x, u=u, **at)).full().ravel() for g, a in ((of.L, of.arguments), (of.G, of.end)))
+    return ocp.longest * L, G
 
 
 def units(ocp: OCP) -> Sizes:

@@ -47,6 +47,8 @@ def _floor(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int, steps: St
         return 0.0
     best = solved_again(fine, labels)
     labels, best = labels[best.success], best[best.success]
+    if not len(best):
+        return 0.0
     lost: Array = labels_gap(InTorch(ocp, dynamics, steps.integrator), labels, best, fine.substeps)
     lost = lost[~np.isnan(lost)]  # 0 / 0; what runs away when it is followed is infinitely bad
     return float(np.median(lost)) if len(lost) else 0.0

@@ -33,7 +33,7 @@ from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.cnd.regression.labels import Labels, Problems
 from nocl.solvers.cnd.regression.regress import fit_net, policy_loss
 from nocl.solvers.cnd.settings import TrainSettings
-from nocl.solvers.cnd.validate import summary
+from nocl.solvers.cnd.validate import over, summary
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.nodes import NodeBank
 from nocl.solvers.ddp.solver import DDP, substeps_for
@@ -256,7 +256,7 @@ class LawTraining:
             fresh = Problems.initial(self.ocp, s.held_out, rng)
             best = self.bank.solve(self.loose, fresh.x, fresh.p, 4)
             run = simulate(self.ocp, CND(self.ocp, self.net, None, {}), fresh.x, p=fresh.given_p)
-            gap = np.where(run.success, run.cost, np.inf)[best.success] / best.cost[best.success] - 1
+            gap = over(np.where(run.success, run.cost, np.inf), best)
             bar.update()
         self.history.append({"round": self.round, "labels": len(self.labels), "unsolved": int((~best.success).sum()),
                              "arrived": float(run.reached.mean()), **summary(gap, "gap")})

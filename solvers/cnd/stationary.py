@@ -26,7 +26,7 @@ from nocl.solvers.cnd.laws import FAR, LawTraining
 from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.cnd.regression.labels import Labels, Problems, continuous_run
 from nocl.solvers.cnd.settings import TrainSettings
-from nocl.solvers.cnd.validate import summary
+from nocl.solvers.cnd.validate import over, summary
 from nocl.solvers.ddp.bank import better
 from nocl.solvers.ddp.global_search import solve_globally
 from nocl.solvers.ddp.solver import DDP, substeps_for
@@ -171,7 +171,7 @@ class StationaryTraining(LawTraining):
             own = self.loose.solve(fresh.x, u=_held(law, x), progress=False)
             best = better(best, pruned(self.loose, own, self.lqr, self.level))
             arrived = self._value(x[:, -1]) < self.level
-            gap = np.where(arrived, J, np.inf)[best.success] / best.cost[best.success] - 1
+            gap = over(np.where(arrived, J, np.inf), best)
             bar.update()
         self.history.append({"round": self.round, "labels": len(self.labels), "unsolved": int((~best.success).sum()),
                              "arrived": float(arrived.mean()), **summary(gap, "gap")})

@@ -128,6 +128,13 @@ def gap(policy: Policy, torch_ocp: InTorch, best: Solution, unit: float = 0.0, s
     return shares
 
 
+def over(J: Array, best: Solution) -> Array:
+    """(J - J*) / |J*| of the optima that were solved; J [B] of all, J* < 0 where something is gained."""
+    found = best[best.success]
+    shares: Array = (J[best.success] - found.cost) / np.abs(found.cost)
+    return shares
+
+
 def own_feedback(plans: Solution, steps: int) -> Policy:
     """Each plan itself as feedback in continuous time, for `steps` steps from where the plans start, row by row; each
     row as often as the stages of an implicit step ask for it.

@@ -37,6 +37,7 @@ RHO_GROWTH = 4.0
 ROUNDS = 5  # times max_iterations are the most that all rounds together take
 STALLS = 2  # rounds at the largest rho in which the violation does not halve: it cannot be held
 PRICE = 100.0  # usual costs for a violation of one scale over the whole horizon, or at its end, if they are elastic
+BENT = 0.1  # damping, up to which second derivatives that are not convex are kept: Mayer problems have no others
 STIFF = 1e7  # usual costs, the weight of active rows in the sweep for gains
 KEPT = ("x", "u", "k", "gain", "J", "c", "parts", "y", "penalty", "state", "mu")  # of a plan
 
@@ -54,8 +55,8 @@ class Augmented(Work):
         d, B = self.ddp, len(self.x0)
         self.unit = usual_sizes(d.posed).cost
         self.y, self.c, self.new_c = (np.zeros((B, d.rows.count(d.intervals))) for _ in range(3))
-        self.penalty = np.zeros((B, 4))  # rho, largest multiplier, weight in a sweep for gains, largest one at the end
-        self.penalty[:, 0] = self.unit
+        self.penalty = np.zeros((B, 5))  # rho, largest multiplier, weight in a sweep for gains, largest one at the end,
+        self.penalty[:, 0], self.penalty[:, 4] = self.unit, 1.0  # and whether a sweep has second derivatives
         share = (d.posed.horizon - self.t0) / d.posed.horizon
         elastic = d.constraints == "elastic"
         self.penalty[:, 1] = PRICE * self.unit * share / d.intervals if elastic else np.inf
@@ -63,6 +64,7 @@ class Augmented(Work):
         self.margin = None if d.margin is None else self.with_margin(np.zeros_like(self.y))
         self.parts, self.new_parts = np.zeros((B, 3)), np.zeros((B, 3))  # cost, sum rho e^2 / 2, max |e|
         self.last, self.stalls = np.full(B, np.inf), np.zeros(B, dtype=np.int64)
+        self.bent = np.ones(B, dtype=bool)  # where sweeps have second derivatives of f and of the rows
         self.cut = np.zeros(B, dtype=bool)  # where constraints are left between nodes, which were to be held there
         super().__post_init__()
         self.most *= ROUNDS
@@ -108,6 +110,24 @@ class Augmented(Work):
             getattr(self, name)[back] = value[back]
         margin[back] = 0.0 if before is None else before[back]
 
+    def _sweep(self, rows: Rows) -> None:
+        """With second derivatives of f and of the rows, damped until they are convex; where that takes more than BENT
+        without them, Gauss-Newton, until they are with BENT about a trajectory to come.
+        """
+        damping = self.mu.copy()
+        self.bent[rows] |= self.mu[rows] == 0
+        again = rows[~self.bent[rows] & (self.refused[rows] < 0)]
+        self.bent[again], self.mu[again] = True, BENT
+        self._backward(rows[self.bent[rows]], 1.0)
+        lost = rows[self.bent[rows] & (self.positive[rows] == 0) & (self.mu[rows] >= BENT)]
+        self.bent[lost] = False
+        self.mu[lost] = np.where(np.isin(lost, again), damping[lost], self.ddp.settings.damping)
+        self._backward(rows[~self.bent[rows]], 0.0)
+
+    def _backward(self, rows: Rows, bend: float) -> None:
+        self.penalty[rows, 4] = bend
+        self.backward(rows)
+
     def _held_in(self) -> list[Array | None]:
         return [self.y, self.margin, self.penalty]
 
@@ -139,8 +159,8 @@ class Augmented(Work):
         super()._stuck(rows)
 
     def _at_saddle(self, rows: Rows) -> None:
-        """Held, it is one of the problem; else a larger rho may bend the merit upwards. Damped sweeps leave out second
-        derivatives: whether it is none is for a sweep without damping to say."""
+        """Held, it is one of the problem; else a larger rho may bend the merit upwards. Whether it is none is for a
+        sweep without damping to say, which has all second derivatives."""
         said = self.undamped[rows]
         self.refused[rows[~said]], self.mu[rows[~said]] = -1.0, 0.0
         rows = rows[said]
@@ -171,7 +191,7 @@ class Augmented(Work):
 
     def _last_sweep(self, *values: Array | None) -> None:
         """Active rows are stiff in it, so that gains keep to them: V_x is the same, V_xx and gains are not."""
-        self.mu[:] = 0
+        self.mu[:], self.penalty[:, 4] = 0, 1.0
         self.penalty[:, 2] = np.where(self.state == CONVERGED, STIFF * self.unit, 0.0)
         every = np.arange(len(self.x0))
         self.backward(every, *values)

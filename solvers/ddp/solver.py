@@ -324,7 +324,7 @@ class DDP:
         work.x[..., :x.shape[2]], work.u[:] = x, u
         rows = np.arange(B)
         while rows.size:
-            work.backward(rows)
+            work._sweep(rows)
             rows = rows[work.positive[rows] == 0]
             work.mu[rows] = np.maximum(GROWTH * work.mu[rows], s.damping)
             work.gain[rows] = 0.0

@@ -116,7 +116,7 @@ class NumpyKernel:
         value, p, P = _rows(self._terminal, x[b, K], *self._at_end(d))
         by_p = _rows(self._terminal_by_p, x[b, K], *self._at_end(d))[0] if self.np else np.zeros((len(b), 0))
         value, P = value[:, 0], P.reshape(-1, n, n)
-        exact = np.ones(len(b)) if self.rows is None else (mu[b] == 0).astype(float)
+        exact = np.ones(len(b)) if self.rows is None else of[2][b, 4]
         if self.rows is not None:
             g, W, g_p = self.rows.model(b, K, K, exact, (x[b, K], *self._at_end(d)), *of)
             p, P, by_p = p + g, P + W, by_p + g_p

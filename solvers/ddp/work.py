@@ -121,6 +121,9 @@ class Work:
         """The states [B, nx] that rollouts begin at."""
         return self.x0
 
+    def _sweep(self, rows: Rows) -> None:
+        self.backward(rows)
+
     def backward(self, rows: Rows, V: Array | None = None, V_x: Array | None = None, V_xx: Array | None = None,
                  V_p: Array | None = None) -> None:
         d = self.ddp
@@ -144,7 +147,7 @@ class Work:
             self.state[rows[self.iterations[rows] >= self.most[rows]]] = OUT_OF_ITERATIONS
             rows = rows[self.state[rows] == RUNNING]
             self.iterations[rows] += 1
-            self.backward(rows)
+            self._sweep(rows)
             good, bad = rows[self.positive[rows] > 0], rows[self.positive[rows] == 0]
             if bad.size:
                 self._refuse(bad)

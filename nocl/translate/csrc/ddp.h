@@ -25,9 +25,9 @@
 
    The kernels take d_ [B, ND] behind h_, t at the start of each problem, and nocl_backward one more result, V_p [B, NP].
 
-   A problem with constraints has what rows.h lists. Its kernels take y [B, ROWS], margin [B, ROWS] or NULL and penalty [B, 4] behind
-   all else, nocl_rollout also c [B, ROWS] and parts [B, 3] = (cost, sum rho e^2 / 2, max |e|), and its J is the merit, cost + psi.
-   Where mu > 0 its sweeps leave out the second derivatives of f and of the rows (Gauss-Newton).
+   A problem with constraints has what rows.h lists. Its kernels take y [B, ROWS], margin [B, ROWS] or NULL and penalty [B, 5] behind
+   all else, nocl_rollout also c [B, ROWS] and parts [B, 3] = (cost, sum rho e^2 / 2, max |e|), and its J is the merit, cost + psi. Its
+   sweeps leave out the second derivatives of f and of the rows (Gauss-Newton) where the last of these five is 0.
 
    Arrays are problem-major, rows as numpy has them: x [B, K+1, N], u [B, K, M], gains [B, K, M, N]. */
 #ifdef ND
@@ -457,7 +457,7 @@ void nocl_backward(int64_t first, int64_t last, const int64_t *index, int64_t K,
 #endif
 #ifdef NC
         const lagrangian rows = lagrangian_of(penalty_, at);
-        const lane bent = truth(reg == 0);
+        const lane bent = rows.bend;
         end_held(&rows, x, BEGIN y_, margin_, at, K, Vx, Vxx BENT BY_P);
 #endif
         for (int64_t t = K;; --t) {

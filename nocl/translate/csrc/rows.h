@@ -8,19 +8,20 @@
    stage_rows_parameters(x, u, d, a, g), end_rows_parameters(x, d, a, g)    g = -(dc/dp)'a, with parameters
 
    A problem's rows stand in [ROWS]: those of stage k from k NC on, those of the end behind all stages. Each has a multiplier y and
-   a margin (c is less by it; the array may be NULL), and each problem four numbers, penalty [B, 4]: rho, the largest multiplier
-   (infinite where constraints are hard), in a sweep for gains the weight of active rows (else 0), and the largest multiplier of
-   the end's own rows.
+   a margin (c is less by it; the array may be NULL), and each problem five numbers, penalty [B, 5]: rho, the largest multiplier
+   (infinite where constraints are hard), in a sweep for gains the weight of active rows (else 0), the largest multiplier of
+   the end's own rows, and 0 where a sweep leaves out second derivatives of f and of the rows (else 1).
 
    With q = y - rho c the multiplier after this step is a, q cut to [0, largest], or to [-largest, largest] of an equality; what is
    added to the cost is psi, whose slope in c is -a; and e = (y - a) / rho is 0 where c and y fit. */
 #define ROWS (K * NC + NT)
 
-typedef struct { lane rho, largest, stiff, at_end, psi, square, worst; } lagrangian;
+typedef struct { lane rho, largest, stiff, at_end, bend, psi, square, worst; } lagrangian;
 
 static lagrangian lagrangian_of(const double *penalty_, const int64_t *at)
 {
-    lagrangian of = {gather(penalty_, at, 4, 0), gather(penalty_, at, 4, 1), gather(penalty_, at, 4, 2), gather(penalty_, at, 4, 3)};
+    lagrangian of = {gather(penalty_, at, 5, 0), gather(penalty_, at, 5, 1), gather(penalty_, at, 5, 2), gather(penalty_, at, 5, 3),
+                     gather(penalty_, at, 5, 4)};
     return of;
 }
 
@@ -112,7 +113,7 @@ void nocl_multipliers(int64_t first, int64_t last, const int64_t *index, int64_t
                 scatter(y_, at, ROWS, row, a);
                 add_row(&after, c, a, equal, most);
             }
-        scatter(penalty_, at, 4, 0, after.rho);
+        scatter(penalty_, at, 5, 0, after.rho);
         scatter(merit_, at, 1, 0, cost + after.psi);
         scatter(parts_, at, 3, 1, after.square);
         scatter(parts_, at, 3, 2, after.worst);
