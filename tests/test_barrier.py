@@ -1,6 +1,7 @@
 """Constraints of states in the output map of a policy: no policy leaves them, and what holds them is left alone."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -13,13 +14,16 @@ from nocl.definition.constraints import TOLERANCE
 from nocl.definition.ocp import OCP
 from nocl.nets import MLP, FeatureNet
 from nocl.solvers.cnd import CND
+from nocl.solvers.cnd.fineness import few_plans
 from nocl.solvers.cnd.held import Held
 from nocl.solvers.cnd.regression.barrier import braked, guarded
 from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.cnd.regression.labels import Problems
 from nocl.solvers.cnd.regression.projection import retracted
+from nocl.solvers.ddp import DDP
 from nocl.translate.arguments import Arguments
 
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 TRACK = 0.5
 
 
@@ -98,14 +102,14 @@ def test_which_rows_the_map_holds():
     assert not guarded(third).any()
 
 
-@pytest.mark.parametrize("lasting", [4.0, 0.0])
-def test_a_limit_that_the_control_moves_at_once_is_held_as_it_stands(lasting):
+@pytest.mark.parametrize("learned", [False, True])
+def test_a_limit_that_the_control_moves_at_once_is_held_as_it_stands(learned):
     """Power u v <= 0.5, force between bounds that move: no policy leaves them, and what holds them is left alone."""
     ocp = on_a_track()
     (_, v), u = ca.vertsplit(ocp.system.x), ocp.system.u
     ocp = replace(ocp, constraints={"power": (None, u * v, 0.5), "force": u + 1 + ca.sin(nocl.time())})
     s, at, rng = ocp.system, ocp.functions.feedback().given(said=ca.SX.sym("said", 1)), np.random.default_rng(0)
-    law = at.function("law", {"u": braked(ocp, at.but("said"), at["said"], lasting)})
+    law = at.function("law", {"u": braked(ocp, at.but("said"), at["said"], 4.0, guarded(ocp, learned=learned))})
     x, t, said = rng.uniform(s.lbx, s.ubx, (500, 2)), rng.uniform(0, 4, 500), rng.uniform(s.lbu, s.ubu, (500, 1))
     u = law(*at.columns(x=x, t=t, said=said)).full().T
     power, force = 0.5 - u[:, 0] * x[:, 1], u[:, 0] + 1 + np.sin(t)
@@ -115,7 +119,7 @@ def test_a_limit_that_the_control_moves_at_once_is_held_as_it_stands(lasting):
     inside = (said[:, 0] * x[:, 1] <= 0.5) & (said[:, 0] + 1 + np.sin(t) >= 0)
     assert 100 < inside.sum() < 400
     np.testing.assert_array_equal(u[inside], said[inside])
-    assert not Held(ocp, learned=not lasting).first.any()
+    assert not Held(ocp, learned).first.any()
 
 
 def with_a_budget(lowest: float) -> OCP:
@@ -135,7 +139,7 @@ def test_a_budget_at_the_end_is_held_all_along_where_nothing_comes_back():
     assert max(run.x[:, -1, 1].max() for run in runs) > 0.99  # all of it is used
     assert not Held(ocp).first.any()
     for other, learned in ((with_a_budget(-1.0), False), (with_a_budget(0.1), False), (ocp, True)):
-        assert not guarded(other, learned).any()
+        assert not guarded(other, learned=learned).any()
         assert (Held(other, learned).first > 0).all()
 
 
@@ -164,6 +168,29 @@ def test_rows_without_a_sure_hold_keep_their_margins(why, xdot, wall):
 def test_a_sample_that_is_not_finite_does_not_decide():
     ocp = car(lambda x, v, u: ca.vertcat(v, u), lambda x, v, u: ca.sqrt(0.7 - x) - 0.4, 0.2)
     assert guarded(ocp).all()
+
+
+@pytest.mark.parametrize(("name", "rows"), [
+    (EXAMPLES / "boost_converter.py", [False, True]),  # without voltage nothing holds the current, and no plan has both
+    ("dubins", [False])])  # that slides along an obstacle: to stand still is what the control could do
+def test_places_where_plans_come_near_decide(name, rows):
+    ocp = nocl.load_ocp(name)
+    plans = few_plans(DDP(ocp, constraints="elastic"))
+    assert not guarded(ocp).any()
+    assert guarded(ocp, plans).tolist() == rows
+    held = Held(ocp, plans=plans)
+    assert ((held.first == 0) == rows).all()
+
+
+def test_a_current_is_held_where_plans_have_it():
+    ocp = nocl.load_ocp(EXAMPLES / "boost_converter.py")
+    at, on = ocp.functions.feedback(), ca.SX(ocp.system.ubu)
+    violation = []
+    for rows in ([False, False], [False, True]):
+        law = at.function("law", {"u": braked(ocp, at, on, ocp.horizon, np.array(rows))})
+        violation.append(nocl.simulate(replace(ocp, horizon=5e-4), law, [[0.8, 13.5]]).violation.max())
+    assert violation[0] > 0.1
+    assert violation[1] <= TOLERANCE
 
 
 def in_the_plane(ball: bool = False) -> OCP:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from nocl.data import Solution
 from nocl.definition.ocp import OCP
 from nocl.definition.sampling import own_numbers
 from nocl.definition.substeps import USUAL, Steps
@@ -34,15 +35,21 @@ def intervals_for(ocp: OCP, dynamics: LearnedDynamics | None, steps: Callable[[i
     return intervals
 
 
+def few_plans(ddp: DDP) -> Solution:
+    """Of STATES initial states, those solutions from u* that succeed."""
+    ocp = ddp.ocp
+    x0, p = ocp.initial_states.sample(STATES, own_numbers(0)), ocp.sample_parameters(STATES, own_numbers(0, 2))
+    found = ddp.solve(x0, p=p if ocp.np else None, progress=False)
+    return found[found.success]
+
+
 def _floor(ocp: OCP, dynamics: LearnedDynamics | None, intervals: int, steps: Steps) -> float:
     """The median of what plans on a grid cost more than finer ones, as feedback in continuous time; 0 where nothing
     says."""
     same = {"dynamics": dynamics, "integrator": steps.integrator, "constraints": "elastic" if ocp.is_held else "hard"}
     coarse = DDP(ocp, intervals=intervals, substeps=steps.substeps, **same)
     fine = DDP(ocp, intervals=4 * intervals, substeps=-(-steps.substeps // 4), **same)
-    x0, p = ocp.initial_states.sample(STATES, own_numbers(0)), ocp.sample_parameters(STATES, own_numbers(0, 2))
-    labels = coarse.solve(x0, p=p if ocp.np else None, progress=False)
-    labels = labels[labels.success]
+    labels = few_plans(coarse)
     if not len(labels):
         return 0.0
     best = solved_again(fine, labels)

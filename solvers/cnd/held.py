@@ -41,10 +41,12 @@ class Held:
     """A problem's constraints: rows along the trajectory, then those at its end.
 
     learned : whether the policy is trained on learned dynamics; the output map holds no rows of states alone then
+    plans : a few solutions, which say where constraints are touched
     """
 
     ocp: OCP
     learned: bool = False
+    plans: Solution | None = None
 
     @property
     def first(self) -> Array:
@@ -60,7 +62,7 @@ class Held:
     @cached_property
     def guarded(self) -> Any:
         """Which rows of states the output map holds."""
-        return guarded(self.ocp, self.learned)
+        return guarded(self.ocp, self.plans, self.learned)
 
     @cached_property
     def scales(self) -> Array:

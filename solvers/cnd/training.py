@@ -36,7 +36,7 @@ from nocl.definition.substeps import FINE, RADAU, RK4, Steps
 from nocl.exports import parity
 from nocl.nets import FeatureNet
 from nocl.solvers.cnd.controller import CND
-from nocl.solvers.cnd.fineness import intervals_for
+from nocl.solvers.cnd.fineness import few_plans, intervals_for
 from nocl.solvers.cnd.held import Held
 from nocl.solvers.cnd.laws import LawTraining, check_law
 from nocl.solvers.cnd.paper import PaperSettings, train_paper
@@ -235,10 +235,11 @@ class Training:
         self.learned = dynamics is not None
         self.integrator, self.substeps = _steps(ocp, dynamics, settings, settings.grid)
         self.in_torch = InTorch(ocp, dynamics, self.integrator)
-        self.held = Held(ocp, self.learned) if ocp.is_held else None
         same: dict[str, Any] = {"dynamics": dynamics, "integrator": self.integrator}
         self.plain = DDP(ocp, intervals=settings.grid, substeps=self.substeps,
-                         constraints="hard" if self.held is None else "elastic", **same)
+                         constraints="elastic" if ocp.is_held else "hard", **same)
+        plans = few_plans(self.plain) if ocp.is_held and not self.learned else None
+        self.held = Held(ocp, self.learned, plans) if ocp.is_held else None
         finer = self.substeps if self.integrator == RADAU else -(-self.substeps // 4)  # layers are as thin as they were
         finest = settings.grid if ocp.system.is_discrete else 4 * settings.grid
         self.fine = DDP(ocp, intervals=finest, substeps=finer, **same)
@@ -272,7 +273,7 @@ class Training:
     @cached_property
     def steps(self) -> int:
         """Of what the policy is judged by, for each interval of the fine grid."""
-        quick = 0 if self.held is None or self.learned else barrier.steps(self.ocp, self.ocp.longest)
+        quick = 0 if self.held is None else barrier.steps(self.ocp, self.ocp.longest, self.held.guarded)
         return max(self.fine.substeps, -(-quick // self.fine.intervals))
 
     def run(self) -> CND:
@@ -451,7 +452,7 @@ class Training:
         with _seeded(self.seed):
             self.net, self.inverse = policy_net(self.ocp, self.labels[: self.first], self.settings.hidden,
                                                 self.settings.control_dt, self.own, self.settings.branches,
-                                                0.0 if self.learned else self.ocp.longest)
+                                                None if self.held is None else self.held.guarded)
         acting = at_rate(self.net, 0.0) if self.settings.control_dt else self.net  # in continuous time
         self.policy = Rolled(acting, self.in_torch)
 
@@ -672,7 +673,7 @@ class Training:
 
     def _identity(self) -> str:
         known = identity(self.ocp, self.settings, self.seed, self.in_torch.function["f"],
-                         **({} if self.held is None else {"constraints": "held"}))
+                         **({} if self.held is None else {"held": str(self.held.guarded.tolist())}))
         return known if self.own is None else fingerprint(known, self.own)
 
     def _save(self) -> None:

@@ -19,20 +19,24 @@ most that U gives. Where b = r B, b stays what it is, and h' -> 0 as h -> 0. Cor
 for which a control is held: b <= -h' / s. The boundary is where half of what is allowed is used up.
 
 Rows are for the map where the control moves that derivative, affinely, as much as usual at all places near the
-boundary, and U gives h' >= 0, or h'' >= 0, at most of them. Others are not, like the distance of a rotor craft from
-what is beside it: the map would do harm by asking for what cannot be. Margins hold such rows (held.py). The map looks
+boundary, and U gives h' >= 0, or h'' >= 0, at most of them. The places are those where plans come near, where some do:
+a converter's current is held by its switch as soon as there is some voltage, and where there is none no plan has much
+current; elsewhere they are all over the box X. Other rows are not for the map, like the distance of a rotor craft from
+what is beside it: it would do harm by asking for what cannot be. Margins hold such rows (held.py). The map looks
 at one row after the other, each with all of U: in a corner of two boundaries it may give too little.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from nocl.data import Solution
 from nocl.definition.constraints import TOLERANCE
 from nocl.definition.ocp import OCP
 from nocl.solvers.cnd.regression.projection import projected, retracted
@@ -44,7 +48,8 @@ BEYOND = TOLERANCE / 4  # of a scale: how far a run gets beyond a boundary withi
 WINDOW = 4  # of corrections: w
 NOTHING = 1e-9  # of a scale
 PASSES = 2  # over the rows, where there are several
-TRIED = 4096  # places at which rows are looked at: of those inside, the quarter nearest to the boundary
+TRIED = 4096  # places in X at which rows are looked at: of those inside, the quarter nearest to the boundary
+TOUCHED = 0.05  # of a scale: how near plans come where they come near
 SURE = 0.1  # of the usual movement: a row that it moves less somewhere is not for the map
 MOSTLY = 0.9  # of these places: where U must be able to turn it back
 IDLE = 1e-9  # of the largest: less is no movement
@@ -62,21 +67,41 @@ class Moved(NamedTuple):
     usual: float  # how far the half of U moves it, a median over X near h = 0
 
 
-def guarded(ocp: OCP, learned: bool = False) -> NDArray[np.bool_]:
+@dataclass(frozen=True, eq=False)
+class Places:
+    """What is known of a row at places: h, how far the half of U moves it, and the most that U gives, [n] each."""
+
+    h: Array
+    size: Array
+    most: Array
+
+    def __len__(self) -> int:
+        return len(self.h)
+
+    def __getitem__(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Places:
+        return Places(self.h[rows], self.size[rows], self.most[rows])
+
+
+def guarded(ocp: OCP, plans: Solution | None = None, learned: bool = False) -> NDArray[np.bool_]:
     """Which rows along a trajectory and at its end [m + those at the end] the map holds: inequalities that the control
     moves soon enough, at once where the dynamics are `learned`, and that are not of the control alone (projection.py).
+
+    plans : solutions that say where a row is touched, where they come near
     """
     found = np.zeros(len(ocp.functions.rows) + len(ocp.functions.end_rows), dtype=bool)
-    found[[i for i, _ in _rows(ocp, learned)]] = True
+    for i, row in _moved_rows(ocp):
+        found[i] = not (learned and row.order) and _sure(ocp, row, plans)
     return found
 
 
-def _rows(ocp: OCP, learned: bool = False) -> list[tuple[int, Moved]]:
-    """Such rows by number; where the equations of motion are not known, and in discrete time, those moved at once."""
+def _moved_rows(ocp: OCP) -> list[tuple[int, Moved]]:
+    """Rows that the control moves, by number; where the equations of motion are not known, and in discrete time, those
+    that it moves at once."""
     of, m = ocp.functions, len(ocp.functions.rows)
     mine = ~of.rows.equal & ~projected(ocp)
-    moved = [(int(i), _at_once(ocp, int(i))) for i in np.flatnonzero(mine & of.rows.of_u)]
-    if not (learned or ocp.system.xdot is None or ocp.system.is_discrete):
+    moved = [(int(i), _at_once(ocp, of.rows.column[int(i)] / float(of.scales[i])))
+             for i in np.flatnonzero(mine & of.rows.of_u)]
+    if ocp.system.xdot is not None and not ocp.system.is_discrete:
         moved += [(int(i), _moved(ocp, of.rows.column[int(i)] / float(of.scales[i])))
                   for i in np.flatnonzero(mine & ~of.rows.of_u)]
         moved += [(m + int(i), _budget(ocp, of.end_rows.column[int(i)] / float(of.end_scales[i])))
@@ -84,24 +109,25 @@ def _rows(ocp: OCP, learned: bool = False) -> list[tuple[int, Moved]]:
     return [(i, row) for i, row in moved if row is not None]
 
 
-def _at_once(ocp: OCP, i: int) -> Moved | None:
-    """Row i of states and controls; None where the map cannot hold it."""
-    h = ocp.functions.rows.column[i] / float(ocp.functions.scales[i])
-    by_u = _by_u(ocp, h)
-    usual = 0.0 if by_u is None else _usual_at_once(ocp, h, by_u)
-    return Moved(h, ca.SX(0), h, 0, usual) if usual > 0 else None
+def _rows(ocp: OCP, held: NDArray[np.bool_] | None) -> list[Moved]:
+    """The rows that are `held`, or those of `guarded`."""
+    held = guarded(ocp) if held is None else held
+    return [row for i, row in _moved_rows(ocp) if held[i]]
+
+
+def _at_once(ocp: OCP, h: ca.SX) -> Moved | None:
+    """A row of states and controls; None where that is not affine in u, or nothing violates it."""
+    return _usually(ocp, Moved(h, ca.SX(0), h, 0, 0.0))
 
 
 def _moved(ocp: OCP, c: ca.SX) -> Moved | None:
-    """The first or second derivative of a row c along f that the control moves; None where the map cannot hold it so.
+    """The first or second derivative of a row c along f that the control moves; None where it does not do so affinely.
     """
-    h, at = c + TOLERANCE / 2, ocp.functions.arguments
+    h, u = c + TOLERANCE / 2, ocp.functions.arguments["u"]
     slope = _along(ocp, h)
     for order, moved in ((1, slope), (2, _along(ocp, slope))):
-        if ca.depends_on(moved, at["u"]):
-            by_u = _by_u(ocp, moved)
-            usual = 0.0 if by_u is None else _usual(ocp, h, moved, by_u)
-            return Moved(h, slope, moved, order, usual) if usual > 0 else None
+        if ca.depends_on(moved, u):
+            return _usually(ocp, Moved(h, slope, moved, order, 0.0))
     return None
 
 
@@ -110,15 +136,19 @@ def _budget(ocp: OCP, c: ca.SX) -> Moved | None:
     row = _moved(ocp, c)
     if row is None or row.order != 1:
         return None
-    most, = _over_places(ocp, _most(ocp, row.moved, ca.jacobian(row.moved, ocp.functions.arguments["u"])))
-    return row if np.isfinite(most).all() and most.max() <= IDLE * row.usual else None
+    most = _in_box(ocp, row).most
+    return row if len(most) == TRIED and most.max() <= IDLE * row.usual else None
 
 
-def _by_u(ocp: OCP, moved: ca.SX) -> ca.SX | None:
-    """Its derivative by u [1, nu]; None where it is not affine in u."""
+def _usually(ocp: OCP, row: Moved) -> Moved | None:
+    """The row with how far it is usually moved; None where that is not affine in u, or nothing."""
     u = ocp.functions.arguments["u"]
-    by_u = ca.jacobian(moved, u)
-    return None if ca.depends_on(by_u, u) else by_u
+    if ca.depends_on(ca.jacobian(row.moved, u), u):
+        return None
+    box = _in_box(ocp, row)
+    near = _near(box, row.order)
+    usual = float(np.median(near.size)) if len(near) else 0.0
+    return row._replace(usual=usual) if usual > IDLE * box.size.max(initial=0.0) else None
 
 
 def _along(ocp: OCP, e: ca.SX) -> ca.SX:
@@ -128,42 +158,51 @@ def _along(ocp: OCP, e: ca.SX) -> ca.SX:
     return change + ca.jtimes(e, at["t"], ca.SX(1)) if "t" in at.names else change
 
 
-def _usual_at_once(ocp: OCP, h: ca.SX, by_u: ca.SX) -> float:
-    """The median size of by_u [1, nu] times half of U where U may violate h >= 0; 0 where no control mends that."""
-    least, most, sizes = _over_places(ocp, -_most(ocp, -h, -by_u), _most(ocp, h, by_u), _size(ocp, by_u))
-    short = np.isfinite(least) & np.isfinite(most) & np.isfinite(sizes) & (least < 0)
-    return float(np.median(sizes[short])) if short.any() and (most[short] >= 0).mean() >= MOSTLY else 0.0
+def _sure(ocp: OCP, row: Moved, plans: Solution | None) -> bool:
+    """Whether the control is a sure hold of a row where plans come near its boundary, or else all over X."""
+    near = _near(_in_box(ocp, row), row.order)
+    if plans is not None:
+        on_plans = _on_plans(ocp, row, plans)
+        touched = on_plans[np.abs(on_plans.h) <= TOUCHED] if row.order else _near(on_plans, 0)
+        near = touched if len(touched) else near
+    steady = row.order == 0 or near.size.min() > SURE * row.usual
+    return bool(steady and (near.most >= 0).mean() >= MOSTLY)
 
 
-def _usual(ocp: OCP, h: ca.SX, moved: ca.SX, by_u: ca.SX) -> float:
-    """The median size of by_u [1, nu] times half of U where h >= 0 is small; 0 where the control is no sure hold."""
-    distance, most, sizes = _over_places(ocp, h, _most(ocp, moved, by_u), _size(ocp, by_u))
-    fine = np.isfinite(distance) & np.isfinite(sizes) & np.isfinite(most) & (distance >= 0)
-    order = np.flatnonzero(fine)[np.argsort(distance[fine])][:max(int(fine.sum()) // 4, 1)]
-    if not order.size:
-        return 0.0
-    usual = float(np.median(sizes[order]))
-    sure = sizes[order].min() > SURE * usual and usual > IDLE * sizes[fine].max()
-    return usual if sure and (most[order] >= 0).mean() >= MOSTLY else 0.0
+def _near(box: Places, order: int) -> Places:
+    """The quarter of the places inside that is nearest to the boundary, or one of them; of a row that is moved at once,
+    where some control violates it."""
+    if order == 0:
+        return box[box.h < 0]
+    inside = box[box.h >= 0]
+    return inside[np.argsort(inside.h)[:max(len(inside) // 4, 1)]]
 
 
-def _over_places(ocp: OCP, *expressions: ca.SX) -> list[Array]:
-    """The values [TRIED] of each expression [1] over X x U."""
-    s, rng, at = ocp.system, np.random.default_rng(0), ocp.functions.arguments
+def _in_box(ocp: OCP, row: Moved) -> Places:
+    """TRIED places in X x U."""
+    s, rng = ocp.system, np.random.default_rng(0)
     x, u = rng.uniform(s.lbx, s.ubx, (TRIED, s.nx)), rng.uniform(s.lbu, s.ubu, (TRIED, s.nu))
-    tried = at.function("tried", {f"e{i}": e for i, e in enumerate(expressions)})
-    values = tried.call(at.columns(x=x, u=u, **ocp.moments(TRIED)))
-    return [np.broadcast_to(value.full().ravel(), TRIED) for value in values]
+    return _places(ocp, row, x=x, u=u, **ocp.moments(TRIED))
 
 
-def _size(ocp: OCP, by_u: ca.SX) -> ca.SX:
-    """How far the half of U moves a row."""
-    return ca.norm_2(by_u.T * ca.DM((ocp.system.ubu - ocp.system.lbu) / 2))
+def _on_plans(ocp: OCP, row: Moved, plans: Solution) -> Places:
+    """The nodes of plans that succeeded, under any control."""
+    s = plans[plans.success]
+    x, t, p = s.x.reshape(-1, s.x.shape[2]), s.t.ravel(), np.repeat(s.parameters, s.x.shape[1], axis=0)
+    u = np.random.default_rng(0).uniform(ocp.system.lbu, ocp.system.ubu, (len(x), ocp.system.nu))
+    return _places(ocp, row, x=x, u=u, t=t, p=p)
 
 
-def _most(ocp: OCP, moved: ca.SX, by_u: ca.SX) -> ca.SX:
-    """A row under the control that moves it the most."""
-    return moved + ca.mtimes(by_u, _best(ocp, by_u) - ocp.functions.arguments["u"])
+def _places(ocp: OCP, row: Moved, **where: Array) -> Places:
+    """What is known of a row there, at places where all of it is finite."""
+    s, at = ocp.system, ocp.functions.arguments
+    by_u = ca.jacobian(row.moved, at["u"])
+    size = ca.norm_2(by_u.T * ca.DM((s.ubu - s.lbu) / 2))
+    most = row.moved + ca.mtimes(by_u, _best(ocp, by_u) - at["u"])
+    tried = at.function("tried", {"h": row.h, "size": size, "most": most})
+    n = len(where["x"])
+    found = np.array([np.broadcast_to(ca.DM(value).full().ravel(), n) for value in tried(*at.columns(**where))])
+    return Places(*found[:, np.isfinite(found).all(axis=0)])
 
 
 def _best(ocp: OCP, by_u: ca.SX) -> ca.SX:
@@ -172,9 +211,9 @@ def _best(ocp: OCP, by_u: ca.SX) -> ca.SX:
     return retracted(ocp, ca.if_else(by_u.T > 0, ca.DM(s.ubu), ca.DM(s.lbu)))
 
 
-def steps(ocp: OCP, lasting: float) -> int:
+def steps(ocp: OCP, lasting: float, held: NDArray[np.bool_] | None = None) -> int:
     """How many steps of RK4 a run takes at least where the map is at work."""
-    return math.ceil(max((lasting / _time(row, lasting) for _, row in _rows(ocp) if row.order), default=1.0))
+    return math.ceil(max((lasting / _time(row, lasting) for row in _rows(ocp, held) if row.order), default=1.0))
 
 
 def _time(row: Moved, lasting: float) -> float:
@@ -183,17 +222,17 @@ def _time(row: Moved, lasting: float) -> float:
     return min(CORRECTION * lasting, quick)
 
 
-def braked(ocp: OCP, at: Arguments, v: ca.SX, lasting: float) -> ca.SX:
-    """v [nu] moved to where the rows of `guarded` are held, at symbols `at` of a policy: x, t[, p][, dt].
+def braked(ocp: OCP, at: Arguments, v: ca.SX, lasting: float, held: NDArray[np.bool_] | None = None) -> ca.SX:
+    """v [nu] moved to where rows are held, at symbols `at` of a policy: x, t[, p][, dt].
 
-    lasting : how long a run is, in the system's unit of time; s and w are shares of it. 0: where that is not known, or
-        where f is not; rows that the control moves itself are held alone
+    lasting : how long a run is, in the system's unit of time; s and w are shares of it
+    held : which rows, as `guarded` says; None: as it says without plans
     """
-    rows = _rows(ocp, learned=not lasting)
+    rows = _rows(ocp, held)
     if not rows:
         return v
     own, said, dt = ocp.functions.arguments, ca.SX.sym("v", ocp.system.nu), ca.SX.sym("dt")
-    wanted = [_wanted(ocp, row, said, ca.fmax(_time(row, lasting), dt)) for _, row in rows]
+    wanted = [_wanted(ocp, row, said, ca.fmax(_time(row, lasting), dt)) for row in rows]
     u = said
     for _ in range(PASSES if len(wanted) > 1 else 1):
         for short, by_u, flat in wanted:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol, cast
 
 import casadi as ca
 import numpy as np
+from numpy.typing import NDArray
 
 from nocl.definition.ocp import OCP
 from nocl.definition.scales import usual_sizes
@@ -188,20 +189,19 @@ def _polynomial(coefficients: Array, tau: ca.SX) -> ca.SX:
 
 def policy_net(ocp: OCP, labels: Labels, sizes: tuple[int, ...], control_dt: bool = False,
                own: ca.Function | None = None, branches: int = 1,
-               lasting: float = 0.0) -> tuple[FeatureNet, ca.Function]:
+               held: NDArray[np.bool_] | None = None) -> tuple[FeatureNet, ca.Function]:
     """(u = clip(mean + spread * y, U), y a tanh network of the features; and u -> y, its inverse inside U). Constraints
-    of u are held on top (projection.py), and with `lasting`, how long a run is, those of states that can be
-    (barrier.py).
+    of u are held on top (projection.py), and those rows of states that are `held` (barrier.py).
 
     control_dt: (x, t[, p], dt) -> u in place of (x, t[, p]) -> u. own: further features. With `branches` > 1 the
     network says as many y, and a number for each: that with the largest number is taken.
     """
     return net_on(ocp, features(ocp, labels, labels.dt if control_dt else None, own=own), labels, sizes, branches,
-                  lasting)
+                  held)
 
 
 def net_on(ocp: OCP, phi: ca.Function, labels: Labels, sizes: tuple[int, ...], branches: int = 1,
-           lasting: float = 0.0) -> tuple[FeatureNet, ca.Function]:
+           held: NDArray[np.bool_] | None = None) -> tuple[FeatureNet, ca.Function]:
     """The same on features phi."""
     s = ocp.system
     mean, spread = ca.DM(labels.u.mean(axis=0)), ca.DM(labels.u.std(axis=0) + 1e-9 * usual_sizes(ocp).u)
@@ -213,7 +213,8 @@ def net_on(ocp: OCP, phi: ca.Function, labels: Labels, sizes: tuple[int, ...], b
 
     said_u = _blended(y, s.nu, branches, clipped)
     at = Arguments.of(phi)
-    outputs = at.function("controls", {"u": retracted(ocp, braked(ocp, at, said_u, lasting))}, y=y)
+    held_u = said_u if held is None else braked(ocp, at, said_u, ocp.longest, held)
+    outputs = at.function("controls", {"u": retracted(ocp, held_u)}, y=y)
     net = FeatureNet(phi, [MLP([phi.numel_out(0), *sizes, said])], outputs)
     return net, ca.Function("inverse", [u], [(u - mean) / spread], ["u"], ["y"])
 
