@@ -72,7 +72,7 @@ def test_the_loss_is_the_likelihood_of_a_mixture() -> None:
     loss = policy_loss(ocp, net, inverse, labels)
     phi = net.features(torch.from_numpy(labels.x), torch.from_numpy(labels.t)[:, None])[0].float()
     y = net.nets[0](phi).detach().double().numpy()
-    target = np.array(inverse(labels.u.T)).T
+    target = np.array(inverse(labels.u.T)[0]).T
     share = np.exp(y[:, 3:]) / np.exp(y[:, 3:]).sum(axis=1, keepdims=True)
     density = (share * np.exp(-((y[:, :3] - target) ** 2) / SAME)).sum(axis=1)
     expected = -SAME * (labels.weight / labels.weight.mean() * np.log(density)).mean()

@@ -3,10 +3,12 @@
 import casadi as ca
 import numpy as np
 import pytest
+import torch
 
 import nocl
-from nocl.solvers.cnd.regression.features import features
+from nocl.solvers.cnd.regression.features import features, policy_net
 from nocl.solvers.cnd.regression.labels import Labels
+from nocl.solvers.cnd.regression.regress import fit_net, policy_loss
 from nocl.solvers.ddp.bank import SolutionBank, extend
 from nocl.solvers.ddp.solver import DDP
 from nocl.solvers.lqr import LQR
@@ -143,3 +145,34 @@ def test_angles_of_a_sensor_are_followed():
     np.testing.assert_allclose(follow(wrapped[[20, 20]], 1.0)[0],
                                cnd(wrapped[20] + [0, 0, 2 * np.pi * np.round((path[0, 2] - wrapped[20, 2]) /
                                                                             (2 * np.pi)), 0], 1.0))
+
+
+def boat(high=2 * np.pi, drag=0.0):
+    """A point at unit speed, the direction its control: one that U has images of; with drag turns differ."""
+    x, y, phi = ca.SX.sym("x"), ca.SX.sym("y"), ca.SX.sym("phi")
+    s = nocl.System("boat", x=ca.vertcat(x, y), u=phi, xdot=ca.vertcat(ca.cos(phi), ca.sin(phi)), lbu=[-np.pi],
+                    ubu=[high], lbx=[-5, -5], ubx=[5, 5])
+    return nocl.OCP(s, horizon=1.0, running=drag * phi**2, terminal=x, initial_states=nocl.Uniform([-1, -1], [1, 1]))
+
+
+def test_controls_that_are_directions_are_found_out():
+    assert boat().periodic_controls == (0,)
+    assert boat(np.pi).periodic_controls == ()  # each direction has one image
+    assert boat(drag=1.0).periodic_controls == ()
+
+
+@pytest.mark.parametrize("middle", [np.pi, 0.5, -2.0])
+def test_images_of_a_direction_have_no_mean(middle):
+    """Labels that say one direction or the other image of it by chance are fitted as if they said one."""
+    ocp, rng = boat(), np.random.default_rng(0)
+    x, t = rng.uniform(-1, 1, (2000, 2)), rng.uniform(0, 1, 2000)
+    true = middle + 0.8 * x[:, :1]
+    images = [true, np.where(true - 2 * np.pi >= -np.pi, true - 2 * np.pi, true + 2 * np.pi)]
+    u = np.where((rng.random((2000, 1)) < 0.5) & (images[1] <= 2 * np.pi), images[1], images[0])
+    u = np.where(u < -np.pi, u + 2 * np.pi, u)
+    labels = Labels(x, t, np.zeros((2000, 0)), u, np.ones(2000), np.zeros(2000))
+    torch.manual_seed(0)
+    net, inverse = policy_net(ocp, labels, (16, 16))
+    fit_net(net, policy_loss(ocp, net, inverse, labels), 2000, iterations=300, batch=256, lr=4e-3, seed=0)
+    off = nocl.CND(ocp, net)(x, t) - true
+    assert np.abs(np.angle(np.exp(1j * off))).max() < 0.4  # the mean of two images is off by 3

@@ -488,23 +488,36 @@ class OCP:
 
         Found out by trying; none where the equations are not known.
         """
+        return tuple(i for i in self.system.angle_indices if self._same_after_a_turn[i])
+
+    @cached_property
+    def periodic_controls(self) -> tuple[int, ...]:
+        """The controls, by index, in which all of that is 2 pi periodic and U is wider: directions, with images in U.
+        """
+        s = self.system
+        wide = s.ubu - s.lbu > 2 * np.pi * (1 + SAME_IMAGE)
+        return tuple(np.flatnonzero(wide & self._same_after_a_turn[s.nx:]).tolist())
+
+    @cached_property
+    def _same_after_a_turn(self) -> Array:
+        """[nx + nu], in which variables all functions are 2 pi periodic."""
         s = self.system
         if s.xdot is None:
-            return ()
+            return np.zeros(s.nx + s.nu, dtype=bool)
         rng = np.random.default_rng(0)
         x, u = rng.uniform(s.lbx, s.ubx, (N_IMAGES, s.nx)).T, rng.uniform(s.lbu, s.ubu, (N_IMAGES, s.nu)).T
         of, at = self.functions, self.moments(N_IMAGES)
 
-        def values(x: Array) -> Array:
+        def values(x: Array, u: Array) -> Array:
             stage, node, end = (a.columns(x=x.T, u=u.T, **at) for a in (of.arguments, of.node, of.end))
             held = [of.h(*node)] if self.states_only else [of.c(*stage), of.c_end(*end)]
             return np.vstack([v.full() for v in (of.f(*stage), of.L(*stage), of.G(*end), *held)])
 
-        here = values(x)
+        here = values(x, u)
         usual = np.abs(here).max(axis=1, keepdims=True)
-        turn = 2 * np.pi * np.eye(s.nx)
-        return tuple(i for i in s.angle_indices
-                     if (np.abs(values(x + turn[:, [i]]) - here) <= SAME_IMAGE * usual).all())
+        turns = np.split(2 * np.pi * np.eye(s.nx + s.nu), [s.nx])
+        there = (values(x + turns[0][:, [i]], u + turns[1][:, [i]]) for i in range(s.nx + s.nu))
+        return np.array([(np.abs(z - here) <= SAME_IMAGE * usual).all() for z in there], dtype=bool)
 
     @property
     def _all_p(self) -> ca.SX:

@@ -32,6 +32,7 @@ DEGREE = 6  # of the polynomials in time
 CONSTANT = 1e-6  # of its usual size: what varies less is as good as constant
 NEAR = 0.01  # of a usual size: distances that small are told apart
 SHARP = 0.1  # of the numbers of branches: differences within which they share
+BEGINS, BESIDE = 64, 0.2  # where a turn of a direction may begin; rad, the width of what counts as there
 LEAST_TIME = 0.025  # of the horizon: time to go is never counted as less
 Part = tuple[ca.SX, Array | float]  # features [k], and the usual size of each
 
@@ -190,8 +191,9 @@ def _polynomial(coefficients: Array, tau: ca.SX) -> ca.SX:
 def policy_net(ocp: OCP, labels: Labels, sizes: tuple[int, ...], control_dt: bool = False,
                own: ca.Function | None = None, branches: int = 1,
                held: NDArray[np.bool_] | None = None) -> tuple[FeatureNet, ca.Function]:
-    """(u = clip(mean + spread * y, U), y a tanh network of the features; and u -> y, its inverse inside U). Constraints
-    of u are held on top (projection.py), and those rows of states that are `held` (barrier.py).
+    """(u = clip(mean + spread * y, U), y a tanh network of the features; and its inverse inside U, u -> y and the y of
+    its image that labels have, see _image). Constraints of u are held on top (projection.py), and those rows of states
+    that are `held` (barrier.py).
 
     control_dt: (x, t[, p], dt) -> u in place of (x, t[, p]) -> u. own: further features. With `branches` > 1 the
     network says as many y, and a number for each: that with the largest number is taken.
@@ -204,9 +206,11 @@ def net_on(ocp: OCP, phi: ca.Function, labels: Labels, sizes: tuple[int, ...], b
            held: NDArray[np.bool_] | None = None) -> tuple[FeatureNet, ca.Function]:
     """The same on features phi."""
     s = ocp.system
-    mean, spread = ca.DM(labels.u.mean(axis=0)), ca.DM(labels.u.std(axis=0) + 1e-9 * usual_sizes(ocp).u)
+    image = ca.Function("image", [u := ca.SX.sym("u", s.nu)], [_image(ocp, u, labels.u)])
+    known = np.ascontiguousarray(image(labels.u.T).full().T)
+    mean, spread = ca.DM(known.mean(axis=0)), ca.DM(known.std(axis=0) + 1e-9 * usual_sizes(ocp).u)
     said = branches * (s.nu + 1) if branches > 1 else s.nu
-    y, u = ca.SX.sym("y", said), ca.SX.sym("u", s.nu)
+    y = ca.SX.sym("y", said)
 
     def clipped(own: ca.SX) -> ca.SX:
         return ca.fmin(ca.fmax(mean + spread * own, ca.DM(s.lbu)), ca.DM(s.ubu))
@@ -216,7 +220,20 @@ def net_on(ocp: OCP, phi: ca.Function, labels: Labels, sizes: tuple[int, ...], b
     held_u = said_u if held is None else braked(ocp, at, said_u, ocp.longest, held)
     outputs = at.function("controls", {"u": retracted(ocp, held_u)}, y=y)
     net = FeatureNet(phi, [MLP([phi.numel_out(0), *sizes, said])], outputs)
-    return net, ca.Function("inverse", [u], [(u - mean) / spread], ["u"], ["y"])
+    return net, ca.Function("inverse", [u], [(u - mean) / spread, (image(u) - mean) / spread], ["u"], ["y", "of_label"])
+
+
+def _image(ocp: OCP, u: ca.SX, labels: Array) -> ca.SX:
+    """u, each control that is a direction within one turn: two images would have their mean for an answer. The turn
+    begins where there are fewest labels [n, nu], a kernel's width apart."""
+    s, images = ocp.system, ca.SX(u)
+    for i in ocp.periodic_controls:
+        begins = np.linspace(s.lbu[i], s.ubu[i] - 2 * np.pi, BEGINS)
+        some = labels[:: -(-len(labels) // 20_000), i]
+        density = np.exp((np.cos(some[:, None] - begins) - 1) / BESIDE**2).mean(axis=0)
+        begin = float(begins[density.argmin()])
+        images[i] = u[i] - 2 * np.pi * ca.floor((u[i] - begin) / (2 * np.pi))
+    return images
 
 
 def _blended(y: ca.SX, nu: int, branches: int, answer: Callable[[ca.SX], ca.SX]) -> ca.SX:

@@ -66,8 +66,8 @@ def policy_loss(ocp: OCP, net: FeatureNet, inverse: ca.Function, labels: Labels)
     1994). Each label pulls at the branch that is near it, and at the numbers.
     """
     to_y = to_torch(inverse)
-    target = to_y(torch.from_numpy(labels.u)).float()
-    low, high = (to_y(torch.from_numpy(np.array(b))[None]).float() for b in (ocp.system.lbu, ocp.system.ubu))
+    target = to_y(torch.from_numpy(labels.u))[1].float()
+    low, high = (to_y(torch.from_numpy(np.array(b))[None])[0].float() for b in (ocp.system.lbu, ocp.system.ubu))
     lowest, highest = target <= low + 1e-4, target >= high - 1e-4
     nu = target.shape[1]
     each = _control_weights(ocp, low, high)
