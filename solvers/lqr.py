@@ -257,14 +257,18 @@ def ended(ocp: OCP, T: float) -> OCP:
     """
     lqr = LQR(ocp)
     _check_seen(lqr)
-    d, P, more = ocp.functions.arguments["x"] - ca.DM(ocp.x_goal), lqr.P(), ca.SX(0)
+    with warnings.catch_warnings():  # of its kinks the problem itself has warned
+        warnings.simplefilter("ignore")
+        return replace(ocp, horizon=T, terminal=all_images(ocp, lqr.P()))
+
+
+def all_images(ocp: OCP, P: Array) -> ca.SX:
+    """d' P d / 2 about the goal, smooth and the same for all images of angles that the problem is periodic in."""
+    d, more = ocp.functions.arguments["x"] - ca.DM(ocp.x_goal), ca.SX(0)
     for i in ocp.periodic:
         more += P[i, i] * (1 - ca.cos(d[i])) ** 2  # (1 - cos)^2 + sin^2 = 2 (1 - cos)
         d[i] = ca.sin(d[i])
-    with warnings.catch_warnings():  # of its kinks the problem itself has warned
-        warnings.simplefilter("ignore")
-        return replace(ocp, horizon=T, terminal=(ca.bilin(ca.DM(P), d, d) + more) / 2)
-
+    return (ca.bilin(ca.DM(P), d, d) + more) / 2
 
 def _check_seen(lqr: LQR) -> None:
     """ValueError where V vanishes along a line through the goal."""
