@@ -271,7 +271,7 @@ def failed(ocp: OCP, message: Sequence[str], t: Array) -> Simulation:
     inf, nan = np.full((4, B), np.inf), np.full((4, B), np.nan)
     x, u = (np.full((B, K, n), np.nan) for n in (ocp.system.nx, ocp.system.nu))
     return Simulation(t, x, u, inf[0], inf[1], inf[2], inf[3], nan[0], nan[1], nan[2], nan[3],
-                      np.zeros(B, dtype=bool), list(message), np.zeros(B, dtype=bool), np.full(B, -1))
+                      np.zeros(B, dtype=bool), list(message), np.zeros(B, dtype=bool), np.full(B, -1), nan[0], nan[1])
 
 
 def joined(ocp: OCP, parts: Sequence[Judgement]) -> Judgement:

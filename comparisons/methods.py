@@ -27,7 +27,7 @@ from nocl.data import Solution
 from nocl.definition.ocp import OCP
 from nocl.definition.sampling import own_numbers
 from nocl.definition.scales import usual_sizes
-from nocl.judge.laws import check_made_for, check_takes_p, policy_function, takes_p
+from nocl.judge.laws import check_made_for, check_takes_p, own_holds, policy_function, takes_p
 from nocl.solvers.nmpc.loop import Loop
 from nocl.support.checks import LARGEST, Array, shown
 
@@ -239,7 +239,7 @@ def _sampled(ocp: OCP, method: Any, rates: Rates) -> list[int]:
     discrete time one a step."""
     if ocp.steps is not None:
         return [ocp.steps]
-    own = getattr(method, "hold", None)
+    own = getattr(method, "hold", None) or own_holds(method, ocp.longest)
     return [rate for rate in rates if rate is not None] or [int(own) if is_count(own) else SAMPLED]  # type: ignore[arg-type]
 
 

@@ -186,7 +186,7 @@ def three_ways(B=12):
         zero, one = np.zeros(B), np.ones(B)
         s = Simulation(t, x, np.zeros((B, 21, 1)), running + terminal, running, terminal, one, one, zero,
                        np.full(B, math.inf), zero, np.ones(B, dtype=bool), [""] * B, np.ones(B, dtype=bool),
-                       np.full(B, -1))
+                       np.full(B, -1), *np.full((2, B), math.nan))
         return Judged(name, "continuous feedback", s, one, one, zero, one, one)
 
     other = x.copy()

@@ -13,6 +13,7 @@ from documents import ROOT
 PACKAGES = ["nocl", *(f"nocl.{name}" for name in (
     "comparisons", "comparisons.report", "comparisons.reproduce", "definition", "exports", "exports.onnx_operations",
     "judge", "solvers", "solvers.cnd", "solvers.cnd.regression", "solvers.ddp", "solvers.levelset", "solvers.nmpc",
+    "solvers.safeguard",
     "support", "sysid", "sysid.logs", "systems", "translate"))]
 FOLDERS = {"comparisons", "solvers", "systems"}  # of nocl, from the top of the repository
 

@@ -253,6 +253,7 @@ class Results:
                 "x_end": s.x[i, -1].tolist(), "error": self.ocp.from_goal(s.x[i, -1], self.parameters[i]).tolist(),
                 "control_magnitude": float(s.control_magnitude[i]),
                 "saturation": float(s.saturation[i]), "clearance": float(s.clearance[i]),
+                "fallbacks": float(s.fallbacks[i]), "lost": float(s.lost[i]),
                 "reached": bool(s.reached[i]), "violation": float(s.violation[i]), "counted": bool(self.counted[i]),
                 "ms_first": float(j.ms_first[i]), "solves": int(j.solves[i]),
                 "ms_per_control": float(j.ms_per_control[i]), "evaluations": float(j.evaluations[i])}

@@ -640,6 +640,18 @@ class OCP:
             warnings.simplefilter("ignore")
             return replace(self, terminal_constraints=wider, scales={**self.scales, **scale})
 
+    def tightened(self, share: float) -> OCP:
+        """The problem of holding all inequalities along the way by a share of their scales more than is asked for."""
+        rows, sizes = self.functions.rows, self.functions.scales
+        room = {name: share * float(size) for name, size in zip(rows.names, sizes, strict=True)} if self.held else {}
+        along = {name: one if one.low == one.high else (one.low + room[name], one.expression, one.high - room[name])
+                 for name, one in self.constraints.items()}
+        bounds = {name: (low + room[name], high - room[name]) for name, (low, high) in self.state_bounds.items()}
+        paths = {name: h - room[name] for name, h in self.path_constraints.items()}
+        with warnings.catch_warnings():  # of its kinks the problem itself has warned
+            warnings.simplefilter("ignore")
+            return replace(self, constraints=along, state_bounds=bounds, path_constraints=paths)
+
     def at(self, p: Any = None) -> OCP:
         """The problem with its parameters folded in as constants: p as [np] or by name, each of them."""
         return self.folded(self.parameters_of(p, 1, f"OCP on {self.system.name!r}, at")[0])

@@ -11,6 +11,8 @@ import casadi as ca
 from nocl.definition.ocp import OCP
 from nocl.support.checks import Array
 
+WHOLE = 1e-9  # relative, by which a duration may miss whole numbers of dt
+
 
 def check_made_for(ocp: OCP, thing: Any, what: str) -> None:
     """ValueError where `thing` (a controller, a value function) was made for a problem on another system.
@@ -80,6 +82,22 @@ def _with_sizes(g: ca.Function, forms: Sequence[tuple[int, ...]], n_out: int, wh
         raise ValueError(f"{what} {g.name()} takes vectors of length {got} and returns {g.numel_out(0)}; {owner} needs "
                          f"{form} with lengths {lengths} -> {n_out}")
     return g
+
+
+def own_holds(controller: Any, duration: float) -> int | None:
+    """How many controls are held in a while by a controller that says how long it holds one, by its `control_dt`; None
+    for others.
+
+    Raises ValueError where that is no whole number.
+    """
+    dt = getattr(controller, "control_dt", None)
+    if not isinstance(dt, float):
+        return None
+    K = round(duration / dt)
+    if abs(duration / dt - K) > WHOLE * max(K, 1) or K < 1:
+        raise ValueError(f"the controller holds each control for dt = {dt:g}, which does not fit into {duration:g}; "
+                         f"expected a whole number of them, like {max(K, 1) * dt:g}")
+    return K
 
 
 def takes_p(ocp: OCP, controller: Any) -> bool:

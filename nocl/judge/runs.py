@@ -52,6 +52,8 @@ class Simulation:
     message: Sequence[str]  # [B], "" or what failed, at which time and state; or what is violated, and by how much
     reached: NDArray[np.bool_]  # [B], whether it reached the horizon
     worst: NDArray[np.int64]  # [B], which row of `measured.shares` is violated most; -1: none is
+    fallbacks: Array  # [B], at how many samples a safeguard went on with its last plan; NaN of other controllers
+    lost: Array  # [B], at how many it had none that is admissible; NaN of other controllers
 
     @property
     def times(self) -> Array:
@@ -266,7 +268,7 @@ class Judge:
             message[i] = f"violates {name!r} by {much}"
         return Simulation(t, x, u, running + terminal, running, terminal, error, np.where(reached, magnitude, np.nan),
                           np.where(reached, saturation, np.nan), measured.nearest(ocp, least, at_end), violation,
-                          reached & ~beyond, message, reached, worst)
+                          reached & ~beyond, message, reached, worst, *np.full((2, len(x)), np.nan))
 
     @staticmethod
     def worst(shares: Array) -> NDArray[np.int64]:

@@ -8,6 +8,8 @@ Three kinds of control are judged alike:
   of K equal intervals, its answer held;
 - open loop, where it is an array u [B, K, nu]: held.
 
+Feedback that says how long it holds a control, by its `control_dt`, as a safeguard does, is sampled so by default.
+
 A system in discrete time is iterated, x+ = F(x, u, t, p): feedback of either kind is asked at every sample, and
 constraints are judged there.
 
@@ -22,6 +24,7 @@ between the nodes too, at BETWEEN times in each interval, those that hold the co
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import casadi as ca
@@ -32,12 +35,21 @@ from nocl.definition import discrete
 from nocl.definition.constraints import TOLERANCE
 from nocl.definition.ocp import OCP
 from nocl.judge.arrival import arriving, arriving_held, planned
-from nocl.judge.laws import answer_of, check_made_for, check_takes_p, dynamics_function, policy_function, takes_p
+from nocl.judge.laws import (
+    answer_of,
+    check_made_for,
+    check_takes_p,
+    dynamics_function,
+    own_holds,
+    policy_function,
+    takes_p,
+)
 from nocl.judge.runs import Ask, Judge, Simulation
 from nocl.support import checks
 from nocl.support.checks import Array
 
 Kicks = Sequence[tuple[float, ArrayLike]]
+COUNTS = ("fallbacks", "lost")  # that a controller may keep of its last run, [B]
 NODES = 81  # that continuous feedback is recorded at, where nobody says
 
 
@@ -53,7 +65,8 @@ def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: i
     p : parameters, where the problem has them: [np] for all, [B, np], or by name (OCP.parameters_of)
     f : casadi.Function (x, u[, t][, p]) -> xdot, or an object with `to_casadi()`
         Another plant than the exact one.
-    hold : K, sample the feedback at K equal intervals; default: continuous where it can be, else nodes - 1
+    hold : K, sample the feedback at K equal intervals; default: continuous where it can be, else as its own
+        `control_dt` has it, or nodes - 1
     nodes : number of nodes that continuous feedback is recorded at; default: 81
     kicks : (time, dx [nx] or [B, nx]), added to the state at that time
     delay : time from a sample of the state to its control, at most an interval; the last control acts meanwhile. The
@@ -101,9 +114,12 @@ def simulate(ocp: OCP, controller: Any, x0: ArrayLike, *, f: Any = None, hold: i
         ask, K = (lambda x, t, k: u[:, k]), u.shape[1]
         _check_delay(delay, 0.0, "open loop, which samples nothing")
     else:
-        ask, K = _feedback(ocp, controller, policy, values), hold or nodes - 1
+        K = hold or own_holds(controller, ocp.horizon - t0) or nodes - 1
+        ask = _feedback(ocp, controller, policy, values)
         _check_delay(delay, (ocp.horizon - t0) / K, f"feedback that is sampled {K} times: sample it less often")
-    return judge.held(ask, rows, np.linspace(t0, ocp.horizon, K + 1), jumps, delay)
+    run = judge.held(ask, rows, np.linspace(t0, ocp.horizon, K + 1), jumps, delay)
+    counts: dict[str, Any] = {name: np.array(getattr(controller, name)) for name in COUNTS if hasattr(controller, name)}
+    return replace(run, **counts)
 
 
 def _lasting(ocp: OCP, duration: float | None) -> OCP:

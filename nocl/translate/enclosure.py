@@ -8,6 +8,7 @@ included. An operation that is not known here, or that is not defined on all of 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -49,7 +50,8 @@ def _outward(found: Interval) -> Interval:
     """Rounded outward; all numbers where it is not defined."""
     low, high = found
     low, high = low - (ULPS * np.abs(low) + TINY), high + (ULPS * np.abs(high) + TINY)
-    return np.where(np.isnan(low) | np.isnan(high), -np.inf, low), np.where(np.isnan(low) | np.isnan(high), np.inf, high)
+    unknown = np.isnan(low) | np.isnan(high)
+    return np.where(unknown, -np.inf, low), np.where(unknown, np.inf, high)
 
 
 def _hull(*values: Array) -> Interval:
@@ -93,7 +95,7 @@ def _sine(a: Interval, ahead: float = 0.0) -> Interval:
     low, high = _hull(np.sin(a[0] + ahead), np.sin(a[1] + ahead))
     slack = 8 * ULPS * (1 + np.abs(a[0]) + np.abs(a[1]))  # of where a top is, in floating point
 
-    def holds(top: float) -> Array:
+    def holds(top: float) -> Any:
         return np.ceil((a[0] - slack - top) / (2 * np.pi)) <= np.floor((a[1] + slack - top) / (2 * np.pi))
 
     low, high = low - slack, high + slack

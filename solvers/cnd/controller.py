@@ -29,6 +29,7 @@ from nocl.nets import FeatureNet
 from nocl.solvers.cnd.regression.features import at_rate, folded
 from nocl.solvers.cnd.regression.labels import LONGEST
 from nocl.solvers.cnd.unwrapped import Unwrapped
+from nocl.solvers.safeguard.guarded import Safeguard
 from nocl.support import checks
 from nocl.support.checks import Array
 from nocl.support.store import reading
@@ -120,6 +121,14 @@ class CND:
         longest = self.ocp.horizon / LONGEST
         checks.between(dt, 0.0, longest * (1 + 1e-9), "dt", "CND.at_rate", f", the horizon over {LONGEST}, as trained")
         return CND(self.ocp, at_rate(self._at_rates, float(dt)), self.value_net, self.card | {"dt": float(dt)})
+
+    def safeguarded(self, ocp: OCP | None = None, *, dt: float, steps: int = 40, margin: float = 1e-3) -> Safeguard:
+        """A law under a safeguard: `steps` controls held for dt are rolled out, and taken where they hold U and the
+        constraints and arrive (nocl.solvers.safeguard.Safeguard).
+
+        ocp : the problem whose constraints are held; default: that which it was trained on, which had none
+        """
+        return Safeguard(self.ocp if ocp is None else ocp, self, dt=dt, steps=steps, margin=margin)
 
     def value(self, x: ArrayLike, t: ArrayLike = 0.0, p: Any = None) -> Array:
         """V(x, t[, p]), the cost-to-go: a number at [nx], or [B] at [B, nx]."""

@@ -1,8 +1,8 @@
-"""A policy under a safeguard: it acts where its plan is known to hold the constraints and to arrive, and else does not.
+"""A policy under a safeguard: it acts where its plan is known to hold the constraints and to arrive.
 
-Hose, Koehler, Zeilinger, Trimpe and others (2025), "Approximate nonlinear model predictive control with safety-augmented
-neural networks", IEEE Transactions on Control Systems Technology (arXiv 2304.09575), with a terminal controller and
-what happens between samples.
+Hose, Köhler, Zeilinger, Trimpe (2025), "Approximate nonlinear model predictive control with
+safety-augmented neural networks", IEEE Transactions on Control Systems Technology (arXiv 2304.09575); with what happens
+between samples, and a terminal set of LQR.
 """
 
 from __future__ import annotations
@@ -59,14 +59,14 @@ class Safeguard:
 
     def __init__(self, ocp: OCP, policy: Any, *, dt: float, steps: int = 40, margin: float = 1e-3) -> None:
         _check(ocp, policy)
-        self.dt = checks.number(dt, "dt", "safeguarded", positive=True)
+        self.control_dt = checks.number(dt, "dt", "safeguarded", positive=True)
         N = checks.whole(steps, "steps", "safeguarded", 1)
         law = policy_function(ocp, policy)
         if law is None:
             raise ValueError(f"safeguarded: the policy is a {type(policy).__name__}; expected a casadi.Function "
                              "(x, t) -> u, or an object with to_casadi(): its plans are rolled out")
         self.ocp, self.margin = ocp, checks.number(margin, "margin", "safeguarded")
-        motion = Motion.of(ocp, self.dt)
+        motion = Motion.of(ocp, self.control_dt)
         self.terminal: TerminalSet = terminal_set(motion, self.margin + motion.between)
         self.steps = Steps(motion, law, self.terminal, N, self.margin, motion.between)
         self.step = self.steps.function()
@@ -116,17 +116,17 @@ class Safeguard:
 
     def __repr__(self) -> str:
         how = "proven" if self.terminal.proven else f"tried: at most {100 * self.terminal.share:.2g} % of it is not"
-        return (f"safeguard on {self.ocp.system.name!r}: {self.steps.N} controls of {self.dt:g}, terminal set "
+        return (f"safeguard on {self.ocp.system.name!r}: {self.steps.N} controls of {self.control_dt:g}, terminal set "
                 f"V <= {self.terminal.level:.3g} ({how})")
 
     def _follow(self, B: int, t: float) -> None:
         """Begin anew, or go on; ValueError for a time that is no next sample."""
         if t <= self.time or len(self.plan) != B or self.time == -np.inf:
             self.reset(B)
-        elif abs(t - self.time - self.dt) > LATE * self.dt:
+        elif abs(t - self.time - self.control_dt) > LATE * self.control_dt:
             raise ValueError(f"the safeguard is asked at t = {t:.6g} after {self.time:.6g}, and holds controls for "
-                             f"{self.dt:g}; expected the next sample: simulate(..., hold=K) with duration / K = "
-                             f"{self.dt:g}")
+                             f"{self.control_dt:g}; expected the next sample: leave hold out of "
+                             "simulate")
 
     def _stepped(self, x: Array, plan: Array) -> tuple[Array, Array, Rows]:
         u, following, status = (part.full().T for part in self.step(x.T, plan.T))
@@ -154,8 +154,8 @@ class Safeguard:
         end = {"terminal set": (None, V, INNER * self.terminal.level)}
         with warnings.catch_warnings():  # of its kinks the problem itself has warned
             warnings.simplefilter("ignore")
-            posed = replace(_tightened(self.ocp, room), horizon=N * self.dt, terminal=V, terminal_constraints=end,
-                            scales={**self.ocp.scales, "terminal set": self.terminal.level})
+            posed = replace(self.ocp.tightened(room), horizon=N * self.control_dt, terminal=V,
+                            terminal_constraints=end, scales={**self.ocp.scales, "terminal set": self.terminal.level})
         return NMPC(posed, N, substeps=self.steps.motion.substeps, integrator="rk4", between=bool(self.ocp.held))
 
 
@@ -173,14 +173,3 @@ def _check(ocp: OCP, policy: Any) -> None:
         raise ValueError(f"safeguarded: the problem on {name!r} has the equations {', '.join(equations)}; expected "
                          f"inequalities, which have an inside: leave them out, ocp.without("
                          f"{', '.join(map(repr, equations))})")
-
-
-def _tightened(ocp: OCP, share: float) -> OCP:
-    """The problem with room to its constraints, as a share of their scales."""
-    of = ocp.functions
-    room = {name: share * float(size) for name, size in zip(of.rows.names, of.scales, strict=True)} if ocp.held else {}
-    along = {name: (one.low + room[name], one.expression, one.high - room[name])
-             for name, one in ocp.constraints.items()}
-    bounds = {name: (low + room[name], high - room[name]) for name, (low, high) in ocp.state_bounds.items()}
-    paths = {name: h - room[name] for name, h in ocp.path_constraints.items()}
-    return replace(ocp, constraints=along, state_bounds=bounds, path_constraints=paths)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import casadi as ca
 import numpy as np
@@ -37,7 +38,7 @@ class Motion:
         tried = [Motion(ocp, dt, n).function(x.T, u.T)[0].full() for n in (*TRIED, 2 * TRIED[-1])]
         half = (ocp.system.ubx - ocp.system.lbx)[:, None] / 2
         known = np.isfinite(tried[-1]).all(axis=0)
-        errors = [float((np.abs(a - b) / half)[:, known].max()) for a, b in zip(tried, tried[1:], strict=False)]
+        errors = [float((np.abs(a - b) / half)[:, known].max()) for a, b in pairwise(tried)]
         for n, error in zip(TRIED, errors, strict=True):
             if error <= EXACT:
                 return Motion(ocp, dt, n)

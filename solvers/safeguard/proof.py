@@ -41,7 +41,7 @@ class Positive:
         if self.n > FEW:
             return False
         inner = self._inner
-        return 0 < inner and self._positive(min(inner, radius), radius)
+        return inner > 0 and self._positive(min(inner, radius), radius)
 
     def convex(self, radius: float) -> bool:
         """Whether it is proven to be convex in a ball: the Hessian of each box's middle outweighs what is left."""

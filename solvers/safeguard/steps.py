@@ -57,7 +57,7 @@ class Steps:
         x, plan = ca.MX.sym("x", s.nx), ca.MX.sym("plan", self.size)
         left, budget, held = plan[0], plan[1], ca.reshape(plan[2:], s.nu, N)
         new = self._rolled(self._by_policy(), x)
-        last = self._rolled(self._by_plan(), x, ca.vertcat(ca.DM(range(N)).T < left, held))
+        last = self._rolled(self._by_plan(), x, ca.vertcat(left > ca.DM(range(N)).T, held))
         good, kept = new.off <= 0, last.off <= 0
         cheaper = new.cost <= ca.fmax(budget, last.cost)
         nearer = ca.logic_and(ca.logic_not(kept), ca.if_else(new.off < HUGE, new.off, HUGE) < last.off)

@@ -67,6 +67,7 @@ def terminal_set(motion: Motion, margin: float) -> TerminalSet:
     margin : of the constraints, in scales
     """
     ocp = motion.ocp
+    _check_goal(ocp, margin)
     P, K = _riccati(motion)
     loop = _Loop(motion, P, K, margin)
     proofs = PROOFS if ocp.system.nx <= FEW else 1
@@ -82,14 +83,23 @@ def terminal_set(motion: Motion, margin: float) -> TerminalSet:
                      "controls for a shorter time dt")
 
 
+def _check_goal(ocp: OCP, margin: float) -> None:
+    """ValueError where the goal pair does not hold a constraint by the margin."""
+    rows = ocp.functions.rows
+    c = ocp.functions.c(ocp.x_goal, ocp.u_goal).full().ravel() if len(rows) else np.zeros(0)
+    for i in np.flatnonzero(c <= margin):
+        raise ValueError(f"safeguarded: at the goal pair of {ocp.system.name!r} the {rows.title(int(i))} holds by "
+                         f"{c[i]:.3g} of its scale; expected more than the margin {margin:.3g}, so that LQR has room about it: "
+                         "move the goal or the constraint, or take a smaller margin")
+
+
 def _riccati(motion: Motion) -> tuple[Array, Array]:
     """(P, K) of LQR with held controls, from the derivatives of the motion at the goal."""
     ocp, m = motion.ocp, motion.function
-    x, u, one = ca.SX.sym("x", ocp.system.nx), ca.SX.sym("u", ocp.system.nu), units(ocp)
-    z, n = ca.vertcat(x, u), ocp.system.nx
-    end, cost, *_ = m(x, u)
-    parts = ca.Function("parts", [x, u], [ca.jacobian(end, z), ca.hessian(cost, z)[0]])(ocp.x_goal, ocp.u_goal)
-    AB, H = (part.full() for part in parts)
+    at, one, n = ocp.functions.arguments, units(ocp), ocp.system.nx
+    z, (end, cost, *_) = ca.vertcat(at["x"], at["u"]), at.call(m)
+    parts = at.function("parts", {"AB": ca.jacobian(end, z), "H": ca.hessian(cost, z)[0]})
+    AB, H = (part.full() for part in parts(ocp.x_goal, ocp.u_goal))
     unit = np.r_[one.x, one.u]
     AB, H = AB / one.x[:, None] * unit, H * unit[:, None] * unit / one.cost
     stages = Stages(AB[:, :n], AB[:, n:], H[:n, :n], H[n:, n:], H[:n, n:])
