@@ -76,7 +76,7 @@ def terminal_set(motion: Motion, margin: float) -> TerminalSet:
             found = bound(level)
             if found > 0:
                 share = 0.0 if proven else 1 - (1 - CONFIDENCE) ** (1 / DRAWN)
-                return TerminalSet(ocp, P, K, found * (1 - ROUNDING), proven, share)
+                return TerminalSet(ocp, P, K, float(found) * (1 - ROUNDING), proven, share)
     raise ValueError(f"safeguarded: about the goal of {ocp.system.name!r} there is no ellipsoid in which LQR, its "
                      f"controls held for {motion.dt:g}, stays within U and the constraints and costs what it says; "
                      "expected a goal pair inside of them, f and L smooth there, and L convex: move it, or hold "
@@ -89,8 +89,8 @@ def _check_goal(ocp: OCP, margin: float) -> None:
     c = ocp.functions.c(ocp.x_goal, ocp.u_goal).full().ravel() if len(rows) else np.zeros(0)
     for i in np.flatnonzero(c <= margin):
         raise ValueError(f"safeguarded: at the goal pair of {ocp.system.name!r} the {rows.title(int(i))} holds by "
-                         f"{c[i]:.3g} of its scale; expected more than the margin {margin:.3g}, so that LQR has room about it: "
-                         "move the goal or the constraint, or take a smaller margin")
+                         f"{c[i]:.3g} of its scale; expected more than the margin {margin:.3g}, so that LQR has room "
+                         "about it: move the goal or the constraint, or take a smaller margin")
 
 
 def _riccati(motion: Motion) -> tuple[Array, Array]:
