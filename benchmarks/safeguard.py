@@ -13,6 +13,7 @@ import argparse
 import sys
 import tempfile
 import time
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -47,7 +48,7 @@ def network(sizes: tuple[int, ...]) -> ca.Function:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         widths = [5, *sizes]
-        layers = [part for a, b in zip(widths, widths[1:], strict=False) for part in (nn.Linear(a, b), nn.Tanh())]
+        layers = [part for a, b in pairwise(widths) for part in (nn.Linear(a, b), nn.Tanh())]
         net = nn.Sequential(*layers, nn.Linear(widths[-1], 1)).double()
     return to_casadi(net, (4, 1), name="policy", in_names=["x", "t"], out_names=["u"])
 

@@ -100,8 +100,11 @@ class Safeguard:
         """
         return self.step
 
-    def to_c(self, folder: str | os.PathLike[str], *, dtype: str = "float64") -> Path:
-        """C99 of step_to_casadi() in `folder`, as SYSTEM_safeguard: no heap, no globals, the plan is the caller's."""
+    def to_c(self, folder: str | os.PathLike[str]) -> Path:
+        """C99 of step_to_casadi() in `folder`, as SYSTEM_safeguard: no heap, no globals, the plan is the caller's.
+
+        In float64 alone: by single precision plans would be rolled out to less than what decides.
+        """
         s, N = self.ocp.system, self.steps.N
         cost = usual_sizes(self.ocp).cost
         bounds = {"x": (s.lbx, s.ubx), "u": (s.lbu, s.ubu), "status": (0, 2),
@@ -111,7 +114,7 @@ class Safeguard:
                   "plan": ["controls left", "what it may cost", *held],
                   "status": ["0: the policy's plan, 1: the last plan, 2: neither is admissible"]}
         return c_code.to_c(self.step, checks.folder(folder, "folder", "to_c"), f"{s.name}_safeguard", bounds=bounds,
-                           labels=labels, dtype=dtype, note=f"{self!r}\nThe first plan is of zeros, that of the next "
+                           labels=labels, note=f"{self!r}\nThe first plan is of zeros, that of the next "
                            "call is `next` of this one.")
 
     def __repr__(self) -> str:

@@ -8,8 +8,6 @@ term can be over the box, is > 0 (branch and bound).
 
 from __future__ import annotations
 
-import math
-from functools import cached_property
 from itertools import product
 
 import casadi as ca
@@ -22,7 +20,8 @@ from nocl.translate.enclosure import Interval, enclosure
 CELLS = 512  # that a ball is cut into, about
 MOST = 100_000  # boxes that are looked at
 FEW = 3  # dimensions, in which that is enough
-HALVINGS = 30  # of the level of the small ball
+BISECTIONS, SAME = 12, 1e-2  # of a radius, until it is found to a share
+SMALLER = 2.0 ** np.arange(-1, -11, -1)  # times a radius, the small balls that are tried
 
 
 class Positive:
@@ -31,7 +30,7 @@ class Positive:
     def __init__(self, e: ca.SX, z: ca.SX) -> None:
         H, g = ca.hessian(e, z)
         self.n = z.numel()
-        self.at = ca.Function("at", [z], [e, ca.densify(g)])
+        self.at = ca.Function("at", [z], [ca.densify(ca.vertcat(e, g))])
         self.hessian = ca.Function("hessian", [z], [ca.vec(ca.densify(H))])
 
     def up_to(self, radius: float) -> bool:
@@ -40,8 +39,8 @@ class Positive:
             return True
         if self.n > FEW:
             return False
-        inner = self._inner
-        return inner > 0 and self._positive(min(inner, radius), radius)
+        inner = next((part for part in radius * SMALLER if self.convex(part)), 0.0)
+        return inner > 0 and self._positive(inner, radius)
 
     def convex(self, radius: float) -> bool:
         """Whether it is proven to be convex in a ball: the Hessian of each box's middle outweighs what is left."""
@@ -51,12 +50,6 @@ class Positive:
         middle, rest = (least + most) / 2, (most - least) / 2
         middle, rest = (middle + middle.transpose(0, 2, 1)) / 2, np.maximum(rest, rest.transpose(0, 2, 1))
         return bool((np.linalg.eigvalsh(middle)[:, 0] >= np.linalg.eigvalsh(rest)[:, -1]).all())
-
-    @cached_property
-    def _inner(self) -> float:
-        """The radius of a small ball in which it is convex; 0 where none was found."""
-        radii = 2.0 ** np.arange(4, 4 - HALVINGS, -1)
-        return float(next((radius for radius in radii if self.convex(radius)), 0.0))
 
     def _positive(self, inner: float, outer: float) -> bool:
         """Whether it is > 0 between two balls."""
@@ -73,11 +66,12 @@ class Positive:
     def _above(self, low: Array, high: Array) -> NDArray[np.bool_]:
         """[B], whether it is > 0 in boxes [n, B]."""
         middle, half = (low + high) / 2, (high - low) / 2
-        value, slope = (part.full() for part in self.at(middle))
+        (value, *below), (_, *above) = enclosure(self.at, middle, middle)
+        slope = np.maximum(np.abs(below), np.abs(above))
         least, most = self._hessians(low, high)
         bend = np.maximum(np.abs(least), np.abs(most))
         with np.errstate(invalid="ignore"):
-            worst = value[0] - (np.abs(slope) * half).sum(axis=0) - np.einsum("ib,bij,jb->b", half, bend, half) / 2
+            worst = value - (slope * half).sum(axis=0) - np.einsum("ib,bij,jb->b", half, bend, half) / 2
         return np.asarray(worst > 0)
 
     def _hessians(self, low: Array, high: Array) -> Interval:
@@ -86,17 +80,29 @@ class Positive:
 
 
 def radius_of(rows: ca.SX, z: ca.SX, radius: float) -> float:
-    """Up to which all rows, > 0 at 0, are >= 0 in a ball of at most `radius`, by their slopes there; exact where they
+    """Up to which all rows, > 0 at 0, are >= 0 in a ball of at most `radius`, by their slopes in it; exact where they
     are linear, 0 where one is not > 0."""
     if not rows.numel():
-        return math.inf
+        return radius
     n = z.numel()
     here = ca.Function("rows", [z], [ca.densify(rows)])(np.zeros(n)).full().ravel()
     slopes = ca.Function("slopes", [z], [ca.vec(ca.densify(ca.jacobian(rows, z)))])
-    steep = np.maximum(*(np.abs(side) for side in enclosure(slopes, *cells(n, radius))))
-    steepest = np.sqrt((steep.reshape(n, len(here), -1) ** 2).sum(axis=0)).max(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return float(np.min(np.where(here > 0, here / steepest, 0.0)))
+
+    def reach(most: float) -> float:
+        """The radius that slopes in a ball allow, at most that of the ball."""
+        steep = np.maximum(*(np.abs(side) for side in enclosure(slopes, *cells(n, most))))
+        steepest = np.sqrt((steep.reshape(n, len(here), -1) ** 2).sum(axis=0)).max(axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return float(np.min(np.where(here > 0, here / steepest, 0.0), initial=most))
+
+    low, high = reach(radius), radius
+    for _ in range(BISECTIONS):
+        if not 0 < low < high * (1 - SAME):
+            break
+        middle = (low + high) / 2
+        found = reach(middle)
+        low, high = max(low, found), high if found == middle else middle
+    return low
 
 
 def cells(n: int, radius: float) -> tuple[Array, Array]:

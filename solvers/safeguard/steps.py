@@ -18,7 +18,7 @@ from nocl.solvers.safeguard.motion import Motion
 from nocl.solvers.safeguard.terminal import TerminalSet
 
 TAKEN, KEPT, NONE = 0, 1, 2  # status: the policy's plan, the last plan, neither is admissible
-HUGE = 1e300  # more is not finite
+HUGE = 1e30  # more is not finite, in single precision too
 
 
 class Outcome(NamedTuple):

@@ -75,7 +75,7 @@ def terminal_set(motion: Motion, margin: float) -> TerminalSet:
         for level in loop.widest * SHRINK ** np.arange(times):
             found = bound(level)
             if found > 0:
-                share = 0.0 if proven else 1 - (1 - CONFIDENCE) ** (1 / DRAWN)
+                share = 0.0 if proven else 1 - ((1 - CONFIDENCE) / TRIES) ** (1 / DRAWN)  # of the levels any
                 return TerminalSet(ocp, P, K, float(found) * (1 - ROUNDING), proven, share)
     raise ValueError(f"safeguarded: about the goal of {ocp.system.name!r} there is no ellipsoid in which LQR, its "
                      f"controls held for {motion.dt:g}, stays within U and the constraints and costs what it says; "
@@ -124,12 +124,13 @@ class _Loop:
 
     @property
     def widest(self) -> float:
-        """The level at which LQR leaves U, or comes near another image of the goal: exactly, by the ellipsoid."""
+        """The level at which LQR leaves U, comes near another image of the goal, or is as wide as X: exactly, by the
+        ellipsoid."""
         s, ocp = self.ocp.system, self.ocp
         room = np.minimum(s.ubu - ocp.u_goal, ocp.u_goal - s.lbu)
         reach = np.linalg.norm(self.K @ self.S, axis=1)
-        angles = np.linalg.norm(self.S[list(ocp.periodic)], axis=1)
-        radii = np.r_[room / reach.clip(1e-300), NEAR / angles]
+        wide = np.linalg.norm(self.S, axis=1)
+        radii = np.r_[room / reach.clip(1e-300), NEAR / wide[list(ocp.periodic)], (s.ubx - s.lbx) / wide]
         return float(radii.min() ** 2 / 2)
 
     @cached_property
@@ -151,8 +152,7 @@ class _Loop:
 
     def proven(self, level: float) -> float:
         """A level that is well for certain, at most `level`; 0 where there is none that this proves."""
-        radius = math.sqrt(2 * level)
-        radius = min(radius, radius_of(self._parts["rows"], self._parts["z"], radius))
+        radius = radius_of(self._parts["rows"], self._parts["z"], math.sqrt(2 * level))
         return radius**2 / 2 if radius > 0 and all(e.up_to(radius) for e in self._positive) else 0.0
 
     def tried(self, level: float) -> float:
