@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+from types import SimpleNamespace
 
 import casadi as ca
 import lq
@@ -171,6 +172,7 @@ def test_kicks_push_states_and_never_parameters():
 
     class Bank:
         scale = np.array([0.3, 0.3, 0.1, 0.3])
+        solution = SimpleNamespace(x=np.array([[[-9.0, -9.0], [9.0, 9.0]]]))  # that leaves X
 
     found = kicked_states(Bank(), lambda x, t, p: -x[:, :1] + p[:, 1:], here, 64, 1.0, np.random.default_rng(0))
     low, high = ocp.parameter_box

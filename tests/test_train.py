@@ -24,9 +24,12 @@ from nocl.solvers.cnd.regression.labels import (
     Problems,
     answered,
     continuous_cost,
+    folded_into,
     kicked_rollout,
+    kicked_states,
     policy_controls,
     tube,
+    tube_states,
 )
 from nocl.solvers.cnd.regression.regress import fit_net, policy_loss
 from nocl.solvers.cnd.validate import advice, gap, held_out, refined, summary, value_scores
@@ -451,6 +454,34 @@ def test_kicked_rollout(pendulum):
     assert np.abs(kicked - x).max() > 0.01
 
 
+def grown(lowest: float) -> tuple[nocl.OCP, SolutionBank]:
+    """n' = u n - n / (1 + n), which means nothing beyond n = -1, in a box [lowest, 100]; and two solutions."""
+    n, u = ca.SX.sym("n"), ca.SX.sym("u")
+    system = nocl.System("cells", x=n, u=u, xdot=u * n - n / (1 + n), lbu=[0], ubu=[1], lbx=[lowest], ubx=[100])
+    ocp = nocl.OCP(system, horizon=2.0, running=u**2, terminal=-n, initial_states=nocl.Uniform([0.5], [1.0]))
+    ddp = DDP(ocp, intervals=10)
+    return ocp, SolutionBank.of(ddp, ddp.solve(ocp.initial_states.sample(2, 0)))
+
+
+@pytest.mark.parametrize("lowest", [0.0, 0.7])
+def test_states_are_drawn_within_bounds_that_no_solution_leaves(lowest):
+    """Cells are never fewer than none; a box that solutions leave is no bound."""
+    ocp, bank = grown(lowest)
+    acting = (bank, lambda x, t: 0 * x, InTorch(ocp))
+    _, near = tube_states(ocp, bank, 200, 1.0, np.random.default_rng(0))
+    kicked = kicked_states(*acting, 200, 1.0, np.random.default_rng(0))
+    assert (bank.solution.x.min() >= lowest) == (lowest == 0)
+    for found in (near, kicked):
+        assert (found.x.min() >= 0) == (lowest == 0)
+        assert found.x.std() > 0.5  # they are moved
+
+
+def test_a_state_is_mirrored_at_its_bound():
+    x = np.array([[-0.2, 5.0], [1.3, -7.0], [9.0, 0.5]])
+    np.testing.assert_allclose(folded_into(x, np.array([0.0, -np.inf]), np.array([1.0, 2.0])),
+                               [[0.2, -1.0], [0.7, -7.0], [0.0, 0.5]])
+
+
 def test_continuous_cost_is_the_judges(pendulum):
     ocp = pendulum[0]
     policy, x0 = feedback(ocp), np.array([[0.2, 0.0], [0.1, -0.2], [-0.15, 0.3]])  # U is not reached: smooth
@@ -656,7 +687,7 @@ def test_a_file_is_no_folder_for_checkpoints(tmp_path):
 
 def test_visited_states_are_kept_in_a_box_that_ends_at_zero(pendulum):
     """Far out is measured by the larger bound; where every state is, it is said."""
-    from nocl.solvers.cnd.regression.labels import kicked_states, visited
+    from nocl.solvers.cnd.regression.labels import visited
 
     ocp, _, _, _ = pendulum
     s = ocp.system
@@ -672,9 +703,9 @@ def test_visited_states_are_kept_in_a_box_that_ends_at_zero(pendulum):
     assert len(visited(ddp, bank, policy, InTorch(problem), 8, 0.1, rng)) == 8
 
     def far_out(seed):
-        """Two states; one that is visited before the first push is not far out."""
+        """Two states under a torque of 1e9; where a run starts is not far out."""
         try:
-            kicked_states(bank, policy, InTorch(problem), 2, 1e9, np.random.default_rng(seed))
+            kicked_states(bank, lambda x, _: x[:, :1] + 1e9, InTorch(problem), 2, 0.1, np.random.default_rng(seed))
         except ValueError as error:
             return "drives every state far out of the box" in str(error)
         return False

@@ -26,6 +26,7 @@ Policy = Callable[..., Tensor]  # (x, t[, p]) -> u
 NEIGHBOURS = 10  # starts where the nearest one's optimum may be of another kind: with parameters, or about walls
 PROBED, RARE, SAME = 300, 0.003, 1e-4  # states by which it is found out whether there are such; costs so close are one
 KEPT = 2  # of them are followed to the end: those cheapest after one iteration
+KEEPS = 1e-6  # of X: how far beyond its bound is not beyond
 NEAR = 0.1  # how near hard problems more are drawn
 SMALL = 0.1  # of a usual cost: what is added to costs before anything is divided by them
 COARSE = (2, 5, 10, 20, 40, 160, 640)  # intervals of tails that are solved for other control rates than the labels'
@@ -167,17 +168,34 @@ class Problems:
 
 def tube_states(ocp: OCP, bank: SolutionBank, n: int, width: float,
                 rng: np.random.Generator) -> tuple[NDArray[np.int64], Problems]:
-    """(rows of the bank, n problems): x = x_row(t0) + width * exp(U(-1.5, 0)) * scale * N(0, I), and p likewise."""
+    """(rows of the bank, n problems): x = x_row(t0) + width * exp(U(-1.5, 0)) * scale * N(0, I), within `limits`, and p
+    likewise, inside of where they lie."""
     rows = rng.integers(0, len(bank), n)
     t0 = rng.uniform(0, 0.97 * ocp.horizon, n) if ocp.steps is None else \
         samples(ocp.system, 0, ocp.steps)[rng.integers(0, ocp.steps, n)]
     x, p = bank.states(rows, t0[:, None])[:, 0], bank.solution.parameters[rows]
     nx = x.shape[1]
     x += width * np.exp(rng.uniform(-1.5, 0, (n, 1))) * bank.scale[:nx] * rng.standard_normal(x.shape)
-    if ocp.np:  # inside of where they lie
+    x = folded_into(x, *limits(ocp, bank))
+    if ocp.np:
         away = width * np.exp(rng.uniform(-1.5, 0, (n, 1))) * bank.scale[nx:] * rng.standard_normal(p.shape)
         p = np.clip(p + away, *ocp.parameter_box)
     return rows, Problems(x, t0, p)
+
+
+def limits(ocp: OCP, bank: SolutionBank) -> tuple[Array, Array]:
+    """(low, high) [nx]: bounds of X that no solution of the bank leaves, as those of concentrations or of numbers of
+    cells, +-inf for others. Beyond them equations often mean nothing, and costs may have no bounds."""
+    s, x = ocp.system, bank.solution.x
+    once, slack = ~np.isin(np.arange(s.nx), list(ocp.periodic)), KEEPS * (s.ubx - s.lbx)
+    low = np.where(once & (x.min(axis=(0, 1)) >= s.lbx - slack), s.lbx, -np.inf)
+    return low, np.where(once & (x.max(axis=(0, 1)) <= s.ubx + slack), s.ubx, np.inf)
+
+
+def folded_into(x: Array, low: Array | float, high: Array | float) -> Array:
+    """x [B, n], mirrored at the bounds that it lies beyond; what is too far beyond for that stands at the other one."""
+    mirrored = np.where(x < low, 2 * low - x, np.where(x > high, 2 * high - x, x))
+    return np.asarray(np.clip(mirrored, low, high))
 
 
 def near(ocp: OCP, at: Problems, n: int, rng: np.random.Generator) -> Problems:
@@ -210,7 +228,8 @@ def kicked_states(bank: SolutionBank, policy: Policy, torch_ocp: InTorch, n: int
     start = Problems.initial(ocp, max(n // (2 if ocp.np else 8), 1), rng)
     if around is not None:
         start = Problems.join([start, near(ocp, around, len(start), rng)])
-    t, x = kicked_rollout(torch_ocp, policy, start, kick * bank.scale[:ocp.system.nx], rng, substeps=substeps)
+    t, x = kicked_rollout(torch_ocp, policy, start, kick * bank.scale[:ocp.system.nx], rng, substeps=substeps,
+                          within=limits(ocp, bank))
     rows, k = rng.integers(0, len(x), n), rng.integers(0, len(t) - 1, n)
     found = Problems(x[rows, k], t[k], start.p[rows])
     far = 10 * np.maximum(np.abs(ocp.system.lbx), np.abs(ocp.system.ubx))
@@ -231,9 +250,10 @@ def answered(ddp: DDP, bank: SolutionBank, policy: Policy, torch_ocp: InTorch, a
 
 
 def kicked_rollout(torch_ocp: InTorch, policy: Policy, start: Problems, kick: Array, rng: np.random.Generator,
-                   steps: int = 160, kicks: int = 6, substeps: int = 1) -> tuple[Array, Array]:
+                   steps: int = 160, kicks: int = 6, substeps: int = 1,
+                   within: tuple[Array | float, Array | float] = (-np.inf, np.inf)) -> tuple[Array, Array]:
     """The policy's states (t [steps+1], x [B, steps+1, nx]) from the start, pushed by N(0, kick^2) at `kicks` random
-    times."""
+    times, not beyond the bounds `within`."""
     ocp, here = torch_ocp.ocp, torch_ocp.at(start.p)
     steps = ocp.steps or steps
     h = ocp.system.dt or ocp.horizon / steps
@@ -243,7 +263,7 @@ def kicked_rollout(torch_ocp: InTorch, policy: Policy, start: Problems, kick: Ar
     with torch.no_grad():
         for k in range(steps):
             push = (times == k).sum(axis=0)[:, None] * kick * rng.standard_normal(start.x.shape)
-            x = x + torch.from_numpy(push)
+            x = torch.from_numpy(np.where(push == 0, x.numpy(), folded_into(x.numpy() + push, *within)))
             t = torch.full((len(x), 1), k * h, dtype=x.dtype)
             x = here.after(x, policy(x, t + asked, *here.p), t, h, substeps)
             path.append(x.numpy())
