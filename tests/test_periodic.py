@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import nocl
-from nocl.solvers.cnd.regression.features import features, policy_net
+from nocl.solvers.cnd.regression.features import _least_passed, features, policy_net
 from nocl.solvers.cnd.regression.labels import Labels
 from nocl.solvers.cnd.regression.regress import fit_net, policy_loss
 from nocl.solvers.ddp.bank import SolutionBank, extend
@@ -176,3 +176,11 @@ def test_images_of_a_direction_have_no_mean(middle):
     fit_net(net, policy_loss(ocp, net, inverse, labels), 2000, iterations=300, batch=256, lr=4e-3, seed=0)
     off = nocl.CND(ocp, net)(x, t) - true
     assert np.abs(np.angle(np.exp(1j * off))).max() < 0.4  # the mean of two images is off by 3
+
+
+def test_a_turn_begins_where_no_solution_turns_through():
+    """From 1 fast through pi to 5, and back slowly: few labels are at pi, but every solution passes there."""
+    way = np.r_[np.full(30, 1.0), 2.0, 3.0, 4.0, np.full(30, 5.0)]
+    angle = np.tile(way, 20) - 2 * np.pi * np.repeat(np.arange(20) % 2, len(way)) * np.tile(way > 3.5, 20)
+    begin = _least_passed(angle, np.tile(np.linspace(0, 1, len(way)), 20), np.linspace(-np.pi, 0, 64))
+    assert -0.9 < begin <= 0.0

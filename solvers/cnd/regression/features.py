@@ -206,7 +206,7 @@ def net_on(ocp: OCP, phi: ca.Function, labels: Labels, sizes: tuple[int, ...], b
            held: NDArray[np.bool_] | None = None) -> tuple[FeatureNet, ca.Function]:
     """The same on features phi."""
     s = ocp.system
-    image = ca.Function("image", [u := ca.SX.sym("u", s.nu)], [_image(ocp, u, labels.u)])
+    image = ca.Function("image", [u := ca.SX.sym("u", s.nu)], [_image(ocp, u, labels)])
     known = np.ascontiguousarray(image(labels.u.T).full().T)
     mean, spread = ca.DM(known.mean(axis=0)), ca.DM(known.std(axis=0) + 1e-9 * usual_sizes(ocp).u)
     said = branches * (s.nu + 1) if branches > 1 else s.nu
@@ -223,17 +223,24 @@ def net_on(ocp: OCP, phi: ca.Function, labels: Labels, sizes: tuple[int, ...], b
     return net, ca.Function("inverse", [u], [(u - mean) / spread, (image(u) - mean) / spread], ["u"], ["y", "of_label"])
 
 
-def _image(ocp: OCP, u: ca.SX, labels: Array) -> ca.SX:
-    """u, each control that is a direction within one turn: two images would have their mean for an answer. The turn
-    begins where there are fewest labels [n, nu], a kernel's width apart."""
+def _image(ocp: OCP, u: ca.SX, labels: Labels) -> ca.SX:
+    """u, each control that is a direction within one turn: two images would have their mean for an answer."""
     s, images = ocp.system, ca.SX(u)
     for i in ocp.periodic_controls:
-        begins = np.linspace(s.lbu[i], s.ubu[i] - 2 * np.pi, BEGINS)
-        some = labels[:: -(-len(labels) // 20_000), i]
-        density = np.exp((np.cos(some[:, None] - begins) - 1) / BESIDE**2).mean(axis=0)
-        begin = float(begins[density.argmin()])
+        begin = _least_passed(labels.u[:, i], labels.t, np.linspace(s.lbu[i], s.ubu[i] - 2 * np.pi, BEGINS))
         images[i] = u[i] - 2 * np.pi * ca.floor((u[i] - begin) / (2 * np.pi))
     return images
+
+
+def _least_passed(angle: Array, t: Array, begins: Array) -> float:
+    """Of the directions `begins` that which fewest labels are beside, and fewest solutions turn through; labels of one
+    stand behind each other in time."""
+    few = slice(None, 20_000)
+    a = angle[few, None]
+    turn, to = (np.angle(np.exp(1j * d)) for d in (np.diff(a, axis=0), begins - a[:-1]))
+    passed = (np.diff(t[few])[:, None] > 0) & (np.abs(to) <= np.abs(turn)) & (to * turn > 0)
+    beside = np.exp((np.cos(a - begins) - 1) / BESIDE**2)
+    return float(begins[(passed.mean(axis=0) + beside.mean(axis=0)).argmin()])
 
 
 def _blended(y: ca.SX, nu: int, branches: int, answer: Callable[[ca.SX], ca.SX]) -> ca.SX:
