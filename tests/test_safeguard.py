@@ -160,6 +160,13 @@ def test_a_sabotaged_policy_never_leaves_the_constraints_and_arrives(name):
     assert (run.fallbacks > 0).all() or name == "now and then"
 
 
+@pytest.mark.parametrize(("answer", "expected"), [(1e16 + 2, 2.0), (-1e300, -2.0), (np.inf, 2.0), (0.3, 0.3),
+                                                  (np.nan, np.nan)])
+def test_answers_are_clipped_to_the_last_bit_and_nan_stays(answer, expected):
+    safe = guarded(mass(), lambda x: answer + 0 * x[0])
+    np.testing.assert_array_equal(safe.steps._by_policy()([1.0, 0, 0, 0], [])[1].full(), [[expected]])
+
+
 @pytest.mark.parametrize("name", ["NaN", "stuck"])
 def test_a_pendulum_swings_up_under_any_policy(name):
     """LQR has no plan from hanging: NMPC is asked for the first one."""

@@ -111,4 +111,4 @@ class Steps:
     def _clipped(self, u: Any) -> Any:
         """u in U; NaN stays NaN, where fmin and fmax would hide it."""
         s = self.ocp.system
-        return u - ca.fmax(u - s.ubu, 0) + ca.fmax(s.lbu - u, 0)
+        return ca.if_else(u < s.lbu, ca.DM(s.lbu), ca.if_else(u > s.ubu, ca.DM(s.ubu), u))
