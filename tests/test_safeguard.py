@@ -56,6 +56,7 @@ def nan(x):
 
 SABOTAGE = {"random weights": wild, "NaN": nan, "stuck": lambda x: ca.MX(2.0),
             "stuck below": lambda x: ca.MX(-2.0), "wrong sign": lambda x: 3 * x[0] + 2 * x[1],
+            "too fast": lambda x: -6 * x[0] - 2 * x[1],
             "NaN near the wall": lambda x: ca.if_else(x[0] < 0.4, nan(x), -1.5 * x[0] - 2 * x[1]),
             "now and then": lambda x: -1.5 * x[0] - 2 * x[1] + 4 * ca.if_else(ca.sin(1e4 * x[0]) > 0.5, 1, 0)}
 
@@ -157,7 +158,7 @@ def test_a_sabotaged_policy_never_leaves_the_constraints_and_arrives(name):
     assert np.abs(run.x[:, -1]).max() < 1e-2
     assert (run.lost == 0).all()
     assert (run.fallbacks <= 80).all()
-    assert (run.fallbacks > 0).all() or name == "now and then"
+    assert (run.fallbacks > 0).all() or name in ("now and then", "too fast")
 
 
 @pytest.mark.parametrize(("answer", "expected"), [(1e16 + 2, 2.0), (-1e300, -2.0), (np.inf, 2.0), (0.3, 0.3),
@@ -392,7 +393,7 @@ def test_between_samples_a_row_is_no_less_than_what_is_held_of_it():
     """Of a pendulum's speed and energy, by fine steps."""
     ocp = pendulum(constraints={"energy": 20 - v**2 / 2 - 9.81 * ca.cos(p)}, state_bounds={"v": (-7, 7)})
     motion, rng = Motion.of(ocp, 0.3), np.random.default_rng(7)
-    assert 0 < motion.between < 1e-2
+    assert 0 < motion.between < 1e-5
     x, a = rng.uniform([-4, -6], [4, 6], (300, 2)).T, rng.uniform(-5, 5, (1, 300))
     said, step, path = motion._least(x, a), ocp.functions.step(soft=False), [x]
     for _ in range(100):
