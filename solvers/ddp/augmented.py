@@ -111,9 +111,13 @@ class Augmented(Work):
         margin[back] = 0.0 if before is None else before[back]
 
     def _sweep(self, rows: Rows) -> None:
-        """With second derivatives of f and of the rows, damped until they are convex; where that takes more than BENT
-        without them, Gauss-Newton, until they are with BENT about a trajectory to come.
+        """Damped, by Gauss-Newton where costs about a goal weigh each control. Else with second derivatives of f and of
+        the rows, damped until they are convex; where that takes more than BENT without them, Gauss-Newton, until they
+        are with BENT about a trajectory to come.
         """
+        if self.ddp.weighed:
+            self._backward(rows, (self.mu[rows] == 0).astype(float))
+            return
         damping = self.mu.copy()
         self.bent[rows] |= self.mu[rows] == 0
         again = rows[~self.bent[rows] & (self.refused[rows] < 0)]
@@ -124,7 +128,7 @@ class Augmented(Work):
         self.mu[lost] = np.where(np.isin(lost, again), damping[lost], self.ddp.settings.damping)
         self._backward(rows[~self.bent[rows]], 0.0)
 
-    def _backward(self, rows: Rows, bend: float) -> None:
+    def _backward(self, rows: Rows, bend: float | Array) -> None:
         self.penalty[rows, 4] = bend
         self.backward(rows)
 

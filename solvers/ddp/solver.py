@@ -19,6 +19,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -131,6 +132,13 @@ class DDP:
         self.kernel = ddp_kernel(self.posed, dynamics, cache, self.substeps, self._multiplied,
                                  self.integrator)
         self._lb, self._ub = np.ascontiguousarray(ocp.system.lbu), np.ascontiguousarray(ocp.system.ubu)
+
+    @cached_property
+    def weighed(self) -> bool:
+        """Whether costs are about a goal, and weigh each control: Gauss-Newton has their curvature."""
+        of = self.posed.functions
+        bends = ca.diag(ca.hessian(of.running, of.arguments["u"])[0])
+        return self.ocp.has_goal and not any(bends[i].is_zero() for i in range(bends.numel()))
 
     @cached_property
     def weights(self) -> tuple[float, ...]:
