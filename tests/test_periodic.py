@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import nocl
-from nocl.solvers.cnd.regression.features import _least_passed, features, policy_net
+from nocl.solvers.cnd.regression.features import _least_passed, features, policy_net, without_clock
 from nocl.solvers.cnd.regression.labels import Labels
 from nocl.solvers.cnd.regression.regress import fit_net, policy_loss
 from nocl.solvers.ddp.bank import SolutionBank, extend
@@ -35,6 +35,22 @@ def test_periodicity_is_found_out():
     assert pendulum(path_constraints=lambda theta: {"gate": 1.5 + ca.sin(theta)}).periodic == (0,)
     assert nocl.load_ocp("cartpole").periodic == ()  # the paper's cost is the square of the angle
     assert pendulum(lambda theta, omega: 1 - ca.cos(theta / 2)).periodic == ()  # 4 pi
+
+
+@pytest.mark.parametrize("law", [features, without_clock])
+def test_one_angle_alone_has_features(law):
+    """All of its state is an angle, so that no state stands in the features as it is."""
+    theta, tau = ca.SX.sym("theta"), ca.SX.sym("tau")
+    s = nocl.System("turntable", x=theta, u=tau, xdot=tau + 0.3 * ca.sin(theta), lbu=[-2], ubu=[2], lbx=[-4], ubx=[4],
+                    angles=["theta"])
+    ocp = nocl.OCP(s, horizon=2.0, running=1 - ca.cos(theta) + 0.1 * tau**2, terminal=2 * (1 - ca.cos(theta)),
+                   x_goal=[0], u_goal=[0], initial_states=nocl.Uniform([-2], [2]))
+    assert ocp.periodic == (0,)
+    rng = np.random.default_rng(0)
+    x, t, u = rng.uniform(-2, 2, (50, 1)), rng.uniform(0, 2, 50), rng.uniform(-2, 2, (50, 1))
+    phi = law(ocp, Labels(x, t, np.zeros((50, 0)), u, np.ones(50), np.zeros(50)))
+    values = phi(*ocp.functions.feedback().columns(x=x, t=t)).full()
+    assert np.ptp(values, axis=1).min() > 0.1  # each tells states or times apart
 
 
 @pytest.mark.parametrize("goal", [0.0, 3.1, -3.1])

@@ -147,6 +147,16 @@ def guarded(ocp, answer, steps=30, dt=DT):
     return Safeguard(ocp, policy(answer), dt=dt, steps=steps, margin=MARGIN)
 
 
+def test_one_constraint_alone_and_nothing_of_u():
+    """CasADi's index by an empty list is a row of a scalar, which would count as a constraint that nothing holds."""
+    ocp = mass(state_bounds={}, scales={"wall": 1.0})
+    safe = guarded(ocp, SABOTAGE["stuck below"])
+    run = nocl.simulate(ocp, safe, ocp.initial_states.sample(3, 1), duration=8.0, tolerance=0.0)
+    assert safe.terminal.proven
+    assert (run.violation == 0).all()
+    assert np.abs(run.x[:, -1]).max() < 1e-2
+
+
 @pytest.mark.parametrize("name", SABOTAGE)
 def test_a_sabotaged_policy_never_leaves_the_constraints_and_arrives(name):
     ocp = mass()

@@ -54,13 +54,13 @@ class Motion:
         at, step, c = of.arguments, of.step(soft=False), self._with_slopes
         x, u = at["x"], at["u"]
         now, slope = c(x, u)
-        start, cost, held = now, ca.SX(0), [now[self.rows_of_u]]
+        start, cost, held = now, ca.SX(0), [now[self.rows_of_u, :]]
         for _ in range(self.substeps):
             x, more = step(x, u, h)
             after, slope_after = c(x, u)
             held += [now + h / 3 * slope, after - h / 3 * slope_after, after]
             now, slope, cost = after, slope_after, cost + more
-        out = {"end": x, "cost": cost, "held": ca.vertcat(*held), "start": start[self.rows_of_x]}
+        out = {"end": x, "cost": cost, "held": ca.vertcat(*held), "start": start[self.rows_of_x, :]}
         return at.function("motion", {name: ca.densify(e) for name, e in out.items()})
 
     @property

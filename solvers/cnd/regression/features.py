@@ -98,10 +98,10 @@ def features(ocp: OCP, labels: Places, dt: Array | None = None, *, plain: bool =
     left = ca.vertcat(*(ca.sin(off[i]) if i in ocp.periodic else off[i] for i in range(s.nx)))
     rush = left / (to_go + LEAST_TIME * ocp.horizon)
     clock = ca.vertcat(tau, ca.log(to_go / ocp.horizon + LEAST_TIME) / 2)
-    parts: list[Part] = [(_standard(state, x, tau, moment, half)[once], 1.0), (ca.vertcat(*angles, clock), 1.0),
+    parts: list[Part] = [(_standard(state, x, tau, moment, half)[once, :], 1.0), (ca.vertcat(*angles, clock), 1.0),
                          *([(rush, np.array([1.0 if i in ocp.periodic else half[i] for i in range(s.nx)]))]
                            if ocp.has_goal else []),
-                         *([(state[once], half[once])] if plain else []),
+                         *([(state[once, :], half[once])] if plain else []),
                          *_of_parameters(ocp, at, off, labels, tau, moment),
                          *([] if own is None else [(at.but("dt").call(own), 0.0)]),
                          *([] if dt is None else [(at["dt"], ocp.horizon)])]
@@ -131,7 +131,7 @@ def without_clock(ocp: OCP, labels: Places, own: ca.Function | None = None) -> c
     off = state - (ocp.goal(at["p"])[0] if ocp.goal_varies else ca.DM(ocp.x_goal))
     left = ca.vertcat(*(ca.sin(off[i]) if i in ocp.periodic else off[i] for i in range(s.nx)))
     angles = [g(state[i]) for i in s.angle_indices for g in (ca.sin, ca.cos)]
-    parts: list[Part] = [(state[once], half[once]), (ca.vertcat(*angles), 1.0),
+    parts: list[Part] = [(state[once, :], half[once]), (ca.vertcat(*angles), 1.0),
                          (ca.asinh(left / (NEAR * half)), 1.0), *([] if own is None else [(at.call(own), 0.0)])]
     if ocp.np:
         low, high = ocp.parameter_box
