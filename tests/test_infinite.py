@@ -131,6 +131,11 @@ def test_the_law_is_lqr_at_the_goal_and_stays_there(law):
     assert run.success.all()
     assert np.abs(run.x[:, -1]).max() < 1e-6
     assert law.card["arrived"] == 1.0
+    safe = law.safeguarded(steps=30)
+    assert 30 * safe.control_dt == pytest.approx(law.card["arrives_in"])
+    guarded = nocl.simulate(ocp, safe, STATES.sample(5, 3), duration=60 * safe.control_dt)
+    assert guarded.lost.max() == 0
+    assert np.abs(guarded.x[:, -1]).max() < 1e-2
     assert np.median(run.cost / LQR(ocp).value(run.x[:, 0])) < 1.01
 
 

@@ -375,6 +375,10 @@ def test_a_law_takes_constraints_that_it_was_not_trained_with():
     assert run.success.all()
     assert "wall" in safe.ocp.constraint_names
     assert not law.safeguarded(dt=DT).ocp.constraint_names
+    with pytest.raises(ValueError, match="expected dt"):
+        law.safeguarded()
+    law.card["arrives_in"] = 4.0  # as training says
+    assert law.safeguarded(steps=20).control_dt == 0.2
 
 
 @pytest.mark.parametrize(("make", "words"), [

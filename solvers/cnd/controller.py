@@ -122,12 +122,19 @@ class CND:
         checks.between(dt, 0.0, longest * (1 + 1e-9), "dt", "CND.at_rate", f", the horizon over {LONGEST}, as trained")
         return CND(self.ocp, at_rate(self._at_rates, float(dt)), self.value_net, self.card | {"dt": float(dt)})
 
-    def safeguarded(self, ocp: OCP | None = None, *, dt: float, steps: int = 40, margin: float = 1e-3) -> Safeguard:
+    def safeguarded(self, ocp: OCP | None = None, *, dt: float | None = None, steps: int = 40,
+                    margin: float = 1e-3) -> Safeguard:
         """A law under a safeguard: `steps` controls held for dt are rolled out, and taken where they hold U and the
         constraints and arrive (nocl.solvers.safeguard.Safeguard).
 
         ocp : the problem whose constraints are held; default: that which it was trained on, which had none
+        dt : default: as long as all `steps` together last the time in which training's solutions got to the goal
         """
+        if dt is None:
+            if "arrives_in" not in self.card:
+                raise ValueError(f"safeguarded: the controller of {self.ocp.system.name!r} does not say how long runs "
+                                 "take to the goal; expected dt, the time that a control is held for")
+            dt = self.card["arrives_in"] / checks.whole(steps, "steps", "safeguarded", 1)
         return Safeguard(self.ocp if ocp is None else ocp, self, dt=dt, steps=steps, margin=margin)
 
     def value(self, x: ArrayLike, t: ArrayLike = 0.0, p: Any = None) -> Array:

@@ -176,6 +176,9 @@ class StationaryTraining(LawTraining):
         self.history.append({"round": self.round, "labels": len(self.labels), "unsolved": int((~best.success).sum()),
                              "arrived": float(arrived.mean()), **summary(gap, "gap")})
 
+    def _card(self) -> dict[str, Any]:
+        return {**super()._card(), "arrives_in": float(self.posed.horizon)}  # in which all solutions get there
+
     def _finished(self) -> FeatureNet:
         """The law with LQR's equilibrium and gain at the goal."""
         net, ocp = self.net, self.ocp
