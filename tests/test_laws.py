@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
 import pytest
+import torch
 
 import nocl
 from nocl.solvers import DDP
-from nocl.solvers.cnd.laws import Switches, law_advice
+from nocl.solvers.cnd.laws import LawTraining, Switches, law_advice
 from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.cnd.regression.labels import Labels
 from nocl.solvers.cnd.settings import TrainSettings
@@ -41,6 +43,21 @@ def least_time(x):
 def bank():
     ocp = problem()
     return NodeBank(ocp, solve_globally(DDP(ocp), STATES.sample(12, 0), starts=4, seed=0, progress=False))
+
+
+def test_a_law_brakes_at_a_limit_whatever_its_network_says():
+    run, rng = LawTraining.__new__(LawTraining), np.random.default_rng(0)
+    run.ocp, run.seed, run.own = problem(state_bounds={"v": (-1.2, 1.2)}, scales={"v": 1.0}), 0, None
+    run.settings = TrainSettings(hidden=(8,))
+    run.bank = SimpleNamespace(solution=SimpleNamespace(t=np.full((3, 41), 3.0)))
+    x, zero = rng.uniform(-2, 2, (200, 2)), np.zeros(200)
+    run.labels = Labels(x, zero, np.zeros((200, 0)), rng.uniform(-1, 1, (200, 1)), np.ones(200), zero)
+    run._network()
+    with torch.no_grad():
+        run.net.double().nets[0].body[-1].bias += 100.0  # it says u = 1
+        u = run.net(torch.tensor([[0.0, 0.0], [0.0, 1.2]], dtype=torch.float64), torch.zeros(2, 1).double())[:, 0]
+    assert u[0] == 1.0
+    assert abs(float(u[1])) < 0.1
 
 
 @pytest.mark.slow

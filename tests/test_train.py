@@ -505,7 +505,10 @@ def loss_parts(u_label):
     net.nets[0] = answer
     net.float()
     loss = policy_loss(ocp, net, inverse, labels)
-    to_y = nocl.to_torch(inverse)
+    to_y_and_label = nocl.to_torch(inverse)
+
+    def to_y(u):
+        return to_y_and_label(u)[0]
 
     def of(u):
         y = to_y(torch.tensor(u, dtype=torch.float64)[:, None]).float().requires_grad_(True)

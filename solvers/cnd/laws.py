@@ -28,6 +28,7 @@ from nocl.definition.substeps import FINE, RADAU
 from nocl.judge.simulation import simulate
 from nocl.nets import FeatureNet
 from nocl.solvers.cnd.controller import CND
+from nocl.solvers.cnd.regression.barrier import guarded
 from nocl.solvers.cnd.regression.features import net_on, without_clock
 from nocl.solvers.cnd.regression.in_torch import InTorch
 from nocl.solvers.cnd.regression.labels import Labels, Problems
@@ -204,7 +205,7 @@ class LawTraining:
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(self.seed)
             phi = without_clock(self.ocp, self.labels, self.own)
-            self.net, self.inverse = net_on(self.ocp, phi, self.labels, s.hidden, s.branches,
+            self.net, self.inverse = net_on(self.ocp, phi, self.labels, s.hidden, s.branches, guarded(self.ocp),
                                             float(np.median(self.bank.solution.t[:, -1])))
 
     def _visit(self) -> None:

@@ -203,8 +203,8 @@ def policy_net(ocp: OCP, labels: Labels, sizes: tuple[int, ...], control_dt: boo
 
 
 def net_on(ocp: OCP, phi: ca.Function, labels: Labels, sizes: tuple[int, ...], branches: int = 1,
-           held: NDArray[np.bool_] | None = None) -> tuple[FeatureNet, ca.Function]:
-    """The same on features phi."""
+           held: NDArray[np.bool_] | None = None, lasting: float | None = None) -> tuple[FeatureNet, ca.Function]:
+    """The same on features phi. lasting : how long a run is; None: the problem's horizon."""
     s = ocp.system
     image = ca.Function("image", [u := ca.SX.sym("u", s.nu)], [_image(ocp, u, labels)])
     known = np.ascontiguousarray(image(labels.u.T).full().T)
@@ -217,7 +217,7 @@ def net_on(ocp: OCP, phi: ca.Function, labels: Labels, sizes: tuple[int, ...], b
 
     said_u = _blended(y, s.nu, branches, clipped)
     at = Arguments.of(phi)
-    held_u = said_u if held is None else braked(ocp, at, said_u, ocp.longest, held)
+    held_u = said_u if held is None else braked(ocp, at, said_u, lasting or ocp.longest, held)
     outputs = at.function("controls", {"u": retracted(ocp, held_u)}, y=y)
     net = FeatureNet(phi, [MLP([phi.numel_out(0), *sizes, said])], outputs)
     return net, ca.Function("inverse", [u], [(u - mean) / spread, (image(u) - mean) / spread], ["u"], ["y", "of_label"])
