@@ -78,7 +78,7 @@ class LQR:
         self.ocp, self.infinite = ocp, infinite
         self.A, self.B = (j.full() for j in ocp.functions.jacobian(ocp.x_goal, ocp.u_goal))
         self.Q, self.R, self.S, self.P_final = _hessians(ocp)
-        _check_equilibrium(ocp)
+        check_equilibrium(ocp)
         if not ocp.system.is_discrete and np.linalg.eigvalsh(self.R).min() <= 0:
             raise ValueError(f"LQR of {ocp.system.name!r}: the Hessian of L in u has the eigenvalues "
                              f"{np.linalg.eigvalsh(self.R).tolist()}; expected > 0: add a cost on each control")
@@ -292,7 +292,8 @@ def _hessians(ocp: OCP) -> tuple[Array, Array, Array, Array]:
     return H[:n, :n], H[n:, n:], H[:n, n:], P
 
 
-def _check_equilibrium(ocp: OCP) -> None:
+def check_equilibrium(ocp: OCP) -> None:
+    """ValueError where f, or a slope of a cost, is not 0 at the goal pair."""
     s, of = ocp.system, ocp.functions
     L_z = of.L_derivatives(ocp.x_goal, ocp.u_goal)[1].full().ravel()
     G_x = of.G_derivatives(ocp.x_goal)[1].full().ravel()

@@ -2,7 +2,9 @@
 
 Every operation gives an interval that holds all values of its arguments' intervals (Moore, Kearfott, Cloud (2009),
 "Introduction to Interval Analysis"), so that what is said of an enclosure is proven for the function, rounding
-included. An operation that is not known here, or that is not defined on all of its interval, has all numbers.
+included. An operation that is not known here, or that is not defined on all of its interval, has all numbers. What is
+concluded from the enclosure of a derivative holds for functions that are smooth: CasADi's derivative of |x| or of a
+condition knows nothing of the kink or the jump.
 """
 
 from __future__ import annotations
@@ -19,6 +21,15 @@ from nocl.translate.instructions import instructions
 ULPS = 4 * np.finfo(np.float64).eps  # relative, by which results are rounded outward: libm's are good to one ulp
 TINY = np.finfo(np.float64).tiny
 Interval = tuple[Array, Array]  # (low, high), each [B]
+SMOOTH = {f"OP_{name}" for name in (  # all that they are not smooth at has derivatives without a bound
+    "INPUT", "OUTPUT", "CONST", "ASSIGN", "ADD", "SUB", "MUL", "DIV", "INV", "NEG", "SQ", "TWICE", "POW", "CONSTPOW",
+    "SQRT", "EXP", "LOG", "SIN", "COS", "TAN", "ASIN", "ACOS", "ATAN", "SINH", "COSH", "TANH", "ASINH", "ACOSH",
+    "ATANH", "LOG1P", "EXPM1", "ERF")}
+
+
+def is_smooth(function: ca.Function) -> bool:
+    """Whether all operations are smooth where their derivatives are bounded: no kink, no jump, no condition."""
+    return all(i.op in SMOOTH for i in instructions(function))
 
 
 def enclosure(function: ca.Function, low: Array, high: Array) -> Interval:

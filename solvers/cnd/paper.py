@@ -11,9 +11,9 @@ departs from it because the plain recipe fails, is a field of `PaperSettings`, a
   of 10^5 and gradients that point nowhere. Started at u*, with a smaller learning rate, it learns to fly.
 - sin_cos: angles go in as sin and cos too, so that u is periodic where it should be.
 - rollouts are RK4, or implicit steps where f is stiff, with the controller inside the ODE. With hold=True they are
-  nocl's discretisation for NMPC, several
-  times as fast (the race's always are), but then the controller is one for that control rate: trained at 12.5 Hz to
-  cost 0.106, cart-pole's has 0.67 in continuous time; trained inside the ODE, 0.147 in a quarter of the iterations.
+  nocl's discretisation for NMPC, several times as fast (the race's always are), but then the controller is one for that
+  control rate: trained at 12.5 Hz to cost 0.106, cart-pole's has 0.67 in continuous time; trained inside the ODE, 0.147
+  in a quarter of the iterations.
   step="euler" with hold=True is the published code.
 
 Without clip, race and sin_cos cart-pole's cost is 4.5 after 600 iterations (it does not swing up; one seed).

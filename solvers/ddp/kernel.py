@@ -26,6 +26,12 @@ Tableau = tuple[tuple[float, ...], tuple[float, ...]]  # of an explicit step: wh
 TABLEAUS: dict[str, Tableau] = {RK4: ((0.0, 0.5, 0.5, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)), MAP: ((0.0,), (1.0,))}
 
 
+def weights_of(mlp: Any) -> int:
+    """How many weights a network has, as csrc/mlp.h reads them."""
+    skip = mlp.sizes[0] * mlp.sizes[-1] if mlp.skip is not None else 0
+    return sum((a + 1) * b for a, b in pairwise(mlp.sizes)) + skip
+
+
 def pack_weights(net: Any) -> Array:
     """All networks' weights in one array, in the order that csrc/mlp.h reads; one number unused before them."""
     parts = []
@@ -136,7 +142,7 @@ class _Net:
         self.by_p = ca.jacobian(phi, p).T @ s  # of v'y, v fixed
         self.hessian = along.T @ _symmetric(q, ca.vertsplit(H)) @ along + through  # of v'y in z, v fixed
         self.tape = (q + 2) * sum(mlp.sizes[1:-1])
-        self.weights = sum((a + 1) * b for a, b in pairwise(mlp.sizes)) + (mlp.skip is not None) * phi.numel() * out
+        self.weights = weights_of(mlp)
 
 
 def _symmetric(q: int, upper: Columns) -> ca.SX:

@@ -26,7 +26,7 @@ from nocl.solvers.lqr import all_images
 from nocl.solvers.nmpc.solver import NMPC
 from nocl.solvers.safeguard.motion import Motion
 from nocl.solvers.safeguard.steps import KEPT, NONE, TAKEN, Steps
-from nocl.solvers.safeguard.terminal import TerminalSet, terminal_set
+from nocl.solvers.safeguard.terminal import TerminalSet, check_goal, terminal_set
 from nocl.support import checks
 from nocl.support.checks import Array
 
@@ -41,14 +41,15 @@ class Safeguard:
 
     While a plan is there (status TAKEN or KEPT) all of this goes on holding, and what plans may cost falls by what was
     paid, for the f that plans are made with, the exact one to the accuracy of its Runge-Kutta steps. It is asked at
-    multiples of dt; an earlier time than the last, or another number of states, begins anew. Where neither plan is
+    multiples of dt, one object for one run: asked again at the last time, at the same states, it answers the same; any
+    other time that is not later, or another number of states, begins anew. Where neither plan is
     admissible (NONE: there is no plan yet, or the state was pushed), NMPC is asked for one, once; where it has none
     either, the plan that misses less acts, and nothing is promised.
 
     Parameters
     ----------
     ocp : OCP with horizon=nocl.INFINITE, with any constraints but equations
-    policy : casadi.Function (x, t) -> u, or an object with `to_casadi()`
+    policy : casadi.Function (x, t) -> u, or an object with `to_casadi()`; asked at t = 0
     dt : time that a control is held for
     steps : N, controls of a plan
     margin : share of their scales by which new plans hold constraints: what errors of the model may use up
@@ -67,6 +68,8 @@ class Safeguard:
                              "(x, t) -> u, or an object with to_casadi(): its plans are rolled out")
         self.ocp, self.margin = ocp, checks.number(margin, "margin", "safeguarded")
         motion = Motion.of(ocp, self.control_dt)
+        self.room = self.margin / INNER + motion.between  # of NMPC's plans to the constraints
+        check_goal(ocp, self.room)
         self.terminal: TerminalSet = terminal_set(motion, self.margin + motion.between)
         self.steps = Steps(motion, law, self.terminal, N, self.margin, motion.between)
         self.step = self.steps.function()
@@ -76,11 +79,18 @@ class Safeguard:
         """The next call begins anew, without a plan, with B states."""
         self.plan, self.status = np.zeros((B, self.steps.size)), np.full(B, TAKEN)
         self.fallbacks, self.lost, self.time = np.zeros(B), np.zeros(B), -np.inf
+        self.asked = self.answer = np.zeros((0, 0))
 
-    def __call__(self, x: ArrayLike, t: float = 0.0) -> Array:
+    def __call__(self, x: ArrayLike, t: float) -> Array:
         """u [nu] or [B, nu] at states x [nx] or [B, nx] and the time of a sample."""
         rows, single = checks.states(x, self.ocp.system.nx, self.ocp.system.name, "x")
-        self._follow(len(rows), float(t))
+        if t != self.time or not np.array_equal(rows, self.asked):
+            self._advance(rows, float(t))
+        return self.answer[0] if single else self.answer
+
+    def _advance(self, rows: Array, t: float) -> None:
+        """The plans and the answer at the next sample."""
+        self._follow(len(rows), t)
         before = self.status
         u, plan, self.status = self._stepped(rows, self.plan)
         lost = np.flatnonzero((self.status == NONE) & (before != NONE))
@@ -88,10 +98,9 @@ class Safeguard:
             given = self.plan.copy()
             given[lost] = self._solved(rows[lost], given[lost])
             u, plan, self.status = self._stepped(rows, given)
-        self.plan, self.time = plan, float(t)
+        self.plan, self.time, self.asked, self.answer = plan, t, rows.copy(), u
         self.fallbacks += self.status == KEPT
         self.lost += self.status == NONE
-        return u[0] if single else u
 
     def step_to_casadi(self) -> ca.Function:
         """step:(x [nx], plan [2 + N nu]) -> (u [nu], next, status); the first plan is of zeros, the next call's `next`.
@@ -153,11 +162,10 @@ class Safeguard:
         """Of plans that end inside of the terminal set, with room to the constraints."""
         P, N = self.terminal.P, self.steps.N
         V = all_images(self.ocp, P)
-        room = self.margin / INNER + self.steps.between
         end = {"terminal set": (None, V, INNER * self.terminal.level)}
         with warnings.catch_warnings():  # of its kinks the problem itself has warned
             warnings.simplefilter("ignore")
-            posed = replace(self.ocp.tightened(room), horizon=N * self.control_dt, terminal=V,
+            posed = replace(self.ocp.tightened(self.room), horizon=N * self.control_dt, terminal=V,
                             terminal_constraints=end, scales={**self.ocp.scales, "terminal set": self.terminal.level})
         return NMPC(posed, N, substeps=self.steps.motion.substeps, integrator="rk4", between=bool(self.ocp.held))
 

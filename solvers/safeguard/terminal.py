@@ -19,10 +19,12 @@ from scipy.linalg import LinAlgError
 
 from nocl.definition.ocp import OCP
 from nocl.definition.scales import units
+from nocl.solvers.lqr import check_equilibrium
 from nocl.solvers.riccati import Stages
 from nocl.solvers.safeguard.motion import Motion
 from nocl.solvers.safeguard.proof import FEW, Positive, radius_of
 from nocl.support.checks import Array
+from nocl.translate.enclosure import is_smooth
 
 FACTOR = 2.0  # times V, the terminal cost
 SHRINK = 0.7  # of the level, where it is not well
@@ -62,15 +64,15 @@ class TerminalSet:
 
 
 def terminal_set(motion: Motion, margin: float) -> TerminalSet:
-    """The largest set that is proven; where none is, the largest in which all was well that was tried.
+    """The largest set that is proven; where none is, as where L or a constraint has kinks, the largest in which all was
+    well that was tried.
 
     margin : of the constraints, in scales
     """
     ocp = motion.ocp
-    _check_goal(ocp, margin)
     P, K = _riccati(motion)
     loop = _Loop(motion, P, K, margin)
-    proofs = PROOFS if ocp.system.nx <= FEW else 1
+    proofs = 0 if not loop.smooth else PROOFS if ocp.system.nx <= FEW else 1
     for proven, bound, times in ((True, loop.proven, proofs), (False, loop.tried, TRIES)):
         for level in loop.widest * SHRINK ** np.arange(times):
             found = bound(level)
@@ -83,14 +85,16 @@ def terminal_set(motion: Motion, margin: float) -> TerminalSet:
                      "controls for a shorter time dt")
 
 
-def _check_goal(ocp: OCP, margin: float) -> None:
-    """ValueError where the goal pair does not hold a constraint by the margin."""
+def check_goal(ocp: OCP, room: float) -> None:
+    """ValueError where the goal pair is not stationary for L, or does not hold a constraint by `room` of its scale."""
+    check_equilibrium(ocp)
     rows = ocp.functions.rows
     c = ocp.functions.c(ocp.x_goal, ocp.u_goal).full().ravel() if len(rows) else np.zeros(0)
-    for i in np.flatnonzero(c <= margin):
+    for i in np.flatnonzero(c <= room):
         raise ValueError(f"safeguarded: at the goal pair of {ocp.system.name!r} the {rows.title(int(i))} holds by "
-                         f"{c[i]:.3g} of its scale; expected more than the margin {margin:.3g}, so that LQR has room "
-                         "about it: move the goal or the constraint, or take a smaller margin")
+                         f"{c[i]:.3g} of its scale; expected more than {room:.3g}, twice the margin and what is left "
+                         "out between samples, so that LQR has room about it: move the goal or the constraint, or take "
+                         "a smaller margin, or a shorter dt")
 
 
 def _riccati(motion: Motion) -> tuple[Array, Array]:
@@ -149,6 +153,11 @@ class _Loop:
     @cached_property
     def _values(self) -> ca.Function:
         return ca.Function("values", [self._parts["z"]], [self._parts[name] for name in ("pays", "cost", "rows")])
+
+    @property
+    def smooth(self) -> bool:
+        """Whether anything can be proven by derivatives."""
+        return is_smooth(self._values)
 
     def proven(self, level: float) -> float:
         """A level that is well for certain, at most `level`; 0 where there is none that this proves."""

@@ -6,7 +6,6 @@ operations of a step takes some microseconds, however few rows there are.
 
 from __future__ import annotations
 
-from itertools import pairwise
 from typing import cast
 
 import casadi as ca
@@ -15,7 +14,7 @@ import torch
 
 from nocl.nets import MLP, FeatureNet
 from nocl.solvers.cnd.regression.in_torch import InTorch
-from nocl.solvers.ddp.kernel import ACTIVATION_KINDS, pack_weights
+from nocl.solvers.ddp.kernel import ACTIVATION_KINDS, pack_weights, weights_of
 from nocl.support.checks import Array
 from nocl.support.compiler import CompilerError, NoCompilerError
 from nocl.support.pool import cores
@@ -90,7 +89,7 @@ def _network(name: str, net: FeatureNet, args: list[ca.SX], given: list[ca.SX]) 
                   f"    {name}_features{g}({', '.join(inputs)}, phi{g});",
                   f"    mlp_values(weights + {weight}, {shape}, {len(mlp.sizes) - 1}, {kind}, {skip}, 1, phi{g}, a{g}, "
                   f"b{g}, y{g});"]
-        weight += sum((a + 1) * b for a, b in pairwise(mlp.sizes)) + skip * mlp.sizes[0] * mlp.sizes[-1]
+        weight += weights_of(mlp)
     answers = ", ".join([*inputs, *(f"y{g}" for g in range(len(y)))])
     head = f"static void {name}_net(const double *weights, {', '.join(f'const lane *{i}' for i in inputs)}, lane *out)"
     return "\n".join([*(emit(f"{name}_features{g}", given, [ca.densify(one)]) for g, one in enumerate(phi)),
